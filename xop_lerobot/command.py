@@ -1,0 +1,211 @@
+"""Commands of a low-level policy: named, bounded, with units, and what of them a robot executes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+
+from xop_lerobot.errors import BadShape, BadValue, UnknownName
+
+
+class Mode(IntEnum):
+    """What the lower body may do; a double pinch toggles it."""
+
+    STATIONARY = 0
+    MOBILE = 1
+
+
+@dataclass(frozen=True)
+class CommandDim:
+    """One entry of a command.
+
+    Attributes:
+        name: The command's own name, ``"vx"``.
+        key: Its LeRobot action key, ``"x.vel"``.
+        unit: ``"m"``, ``"rad"``, ``"m/s"`` or ``"rad/s"``.
+        low: Lower bound [unit].
+        high: Upper bound [unit].
+        neutral: Value at which the robot stands at rest [unit].
+        max_rate: Largest change per second that the robot executes [unit/s].
+        mobile_only: Whether the entry is held at `neutral` in stationary mode.
+    """
+
+    name: str
+    key: str
+    unit: str
+    low: float
+    high: float
+    neutral: float
+    max_rate: float
+    mobile_only: bool = False
+
+
+@dataclass(frozen=True)
+class CommandSpace:
+    r"""The admissible set :math:`\mathcal A = \{a \mid a_{min} \le a \le a_{max}\}` (Eq. 1d).
+
+    Attributes:
+        dims: The entries, in order.
+    """
+
+    dims: tuple[CommandDim, ...]
+
+    def __len__(self) -> int:
+        return len(self.dims)
+
+    def _column(self, field: str) -> np.ndarray:
+        column = np.array([getattr(dim, field) for dim in self.dims], dtype=float)
+        column.setflags(write=False)
+        return column
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names in order. Shape (k,)."""
+        return tuple(dim.name for dim in self.dims)
+
+    @cached_property
+    def keys(self) -> tuple[str, ...]:
+        """LeRobot action keys in order. Shape (k,)."""
+        return tuple(dim.key for dim in self.dims)
+
+    @cached_property
+    def low(self) -> np.ndarray:
+        """Lower bounds. Shape (k,)."""
+        return self._column("low")
+
+    @cached_property
+    def high(self) -> np.ndarray:
+        """Upper bounds. Shape (k,)."""
+        return self._column("high")
+
+    @cached_property
+    def neutral(self) -> np.ndarray:
+        """Neutral command. Shape (k,)."""
+        return self._column("neutral")
+
+    @cached_property
+    def max_rate(self) -> np.ndarray:
+        """Rate limits per second. Shape (k,)."""
+        return self._column("max_rate")
+
+    @cached_property
+    def mobile_only(self) -> np.ndarray:
+        """Whether an entry is neutral in stationary mode. Shape (k,), bool."""
+        column = np.array([dim.mobile_only for dim in self.dims], dtype=bool)
+        column.setflags(write=False)
+        return column
+
+    def index(self, name: str) -> int:
+        """Return the position of `name`.
+
+        Raises:
+            UnknownName: Listing the names of this space.
+        """
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise UnknownName("command", name, self.names) from None
+
+    def limit(
+        self, command: np.ndarray, previous: np.ndarray | None, dt: float, mode: Mode
+    ) -> np.ndarray:
+        r"""Clip to the bounds and to :math:`|a - a_{prev}| \le \dot a_{max}\,dt`.
+
+        Entries that are `mobile_only` go to neutral in stationary mode, also at their rate.
+
+        Args:
+            command: Wanted command. Shape (k,).
+            previous: Command executed last, None for no rate limit. Shape (k,).
+            dt: Time since then [s].
+            mode: Mode of the robot.
+
+        Returns:
+            The command to execute. Shape (k,).
+        """
+        command = check_vector("command", command, len(self))
+        wanted = np.where(self.mobile_only & (mode == Mode.STATIONARY), self.neutral, command)
+        wanted = np.clip(wanted, self.low, self.high)
+        if previous is None:
+            return wanted
+        step = self.max_rate * dt
+        return np.clip(wanted, previous - step, previous + step)
+
+
+@dataclass(frozen=True)
+class RobotAction:
+    """What one `send_action` asks of a robot.
+
+    Attributes:
+        command: Low-level command. Shape (k,).
+        mode: Stationary or mobile.
+        arms: Arm joint targets [rad], then gripper openings [m]. Shape (m,).
+    """
+
+    command: np.ndarray
+    mode: Mode
+    arms: np.ndarray
+
+
+MODE_KEY = "mode.pos"
+
+
+@dataclass(frozen=True)
+class ActionLayout:
+    """How a `RobotAction` is laid out in LeRobot's flat action dictionary.
+
+    Attributes:
+        space: The command space.
+        arm_names: Arm joints, then grippers, as the low-level policy takes them. Shape (m,).
+    """
+
+    space: CommandSpace
+    arm_names: tuple[str, ...]
+
+    @cached_property
+    def keys(self) -> tuple[str, ...]:
+        """Action keys in the order of the dataset's `action` column."""
+        return (*self.space.keys, MODE_KEY, *(f"{name}.pos" for name in self.arm_names))
+
+    def to_dict(self, action: RobotAction) -> dict[str, float]:
+        """Return the flat dictionary of `action`."""
+        values = (*action.command, float(action.mode), *action.arms)
+        return {key: float(value) for key, value in zip(self.keys, values, strict=True)}
+
+    def from_dict(self, values: Mapping[str, float], previous: RobotAction) -> RobotAction:
+        """Read a flat, possibly partial dictionary; what is absent stays as in `previous`.
+
+        Raises:
+            UnknownName: If a key is not an action key of this robot.
+            BadValue: If a value is not a finite number.
+        """
+        flat = self.to_dict(previous)
+        for key, value in values.items():
+            if key not in flat:
+                raise UnknownName("action key", key, self.keys)
+            number = float(value)
+            if not np.isfinite(number):
+                raise BadValue(f"action {key!r} must be finite, got {number}")
+            flat[key] = number
+        column = np.array(list(flat.values()))
+        k = len(self.space)
+        mode = Mode.MOBILE if column[k] >= 0.5 else Mode.STATIONARY  # noqa: PLR2004
+        return RobotAction(column[:k], mode, column[k + 1 :])
+
+
+def check_vector(name: str, vector: np.ndarray, size: int) -> np.ndarray:
+    """Return `vector` as a float array of shape (size,).
+
+    Raises:
+        BadShape: If it has another shape.
+        BadValue: If it holds a number that is not finite.
+    """
+    array = np.asarray(vector, dtype=float)
+    if array.shape != (size,):
+        raise BadShape(name, (size,), array.shape)
+    if not np.isfinite(array).all():
+        raise BadValue(f"{name} must be finite, got {array}")
+    return array

@@ -1,0 +1,89 @@
+"""The interface of a low-level policy π(x, a, h) and the registry of its implementations."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.registry import Registry
+
+POLICY_DT = 0.02
+"""Period of every low-level policy [s] (50 Hz)."""
+
+
+class PolicyOutput(NamedTuple):
+    """What one step of a low-level policy returns.
+
+    Attributes:
+        targets: Control of every actuator, in the model's actuator order. Shape (n, nu).
+        memory: The policy's memory after the step. Shape (n, nm).
+    """
+
+    targets: np.ndarray
+    memory: np.ndarray
+
+
+class LowLevelPolicy(ABC):
+    r"""A closed-loop controller :math:`\tau_k = \pi(x_k, a_k, h_k)` (Eq. 1b), batched.
+
+    The policy runs at 50 Hz; the model's actuators turn its targets into torques at every
+    physics step, so gains and torque limits live in the model. All state between steps is in
+    `memory`, a plain array: it is copied from the plant into every rollout at each solve.
+    An implementation is a pure function of its arguments, never of what it was asked before.
+    """
+
+    name: str
+    memory_size: int
+
+    @abstractmethod
+    def initial_memory(self, n: int = 1) -> np.ndarray:
+        """Memory of a policy that has not run yet. Shape (n, memory_size)."""
+
+    @abstractmethod
+    def act(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        command: np.ndarray,
+        arms: np.ndarray,
+        memory: np.ndarray,
+        mode: Mode,
+    ) -> PolicyOutput:
+        """Compute motor targets for the next 20 ms.
+
+        Args:
+            qpos: Generalised positions, MuJoCo order. Shape (n, nq).
+            qvel: Generalised velocities, MuJoCo order. Shape (n, nv).
+            command: Commands, in the robot's `CommandSpace`. Shape (n, k).
+            arms: Arm joint targets [rad], then gripper openings [m]. Shape (n, m).
+            memory: Memory of each member of the batch. Shape (n, memory_size).
+            mode: Stationary or mobile, one for the batch.
+
+        Returns:
+            Targets and the memory after the step; the inputs are left untouched.
+        """
+
+
+POLICIES: Registry[Callable[..., LowLevelPolicy]] = Registry("low-level policy")
+"""Factories by name, called as ``factory(path=None)``; a morphology names those that fit it."""
+
+
+def make_policy(name: str, path: str | None = None) -> LowLevelPolicy:
+    """Make the low-level policy `name`.
+
+    Args:
+        name: A registered name, for example ``"falcon"``.
+        path: The policy's file, where it takes one; None for its own default.
+
+    Raises:
+        UnknownName: Listing the known policies.
+        PolicyFileError: If the file is missing, altered or of the wrong shape.
+    """
+    # Implementations register themselves when they are imported.
+    from xop_lerobot.low_level import diff_drive, falcon, student  # noqa: F401, PLC0415
+
+    return POLICIES[name](path=path)

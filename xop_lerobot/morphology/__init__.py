@@ -1,0 +1,1 @@
+"""What a robot is to the retargeter: models, command space, frames, contacts, parameters."""

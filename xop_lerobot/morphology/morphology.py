@@ -1,0 +1,110 @@
+"""The interface that a third robot implements, and the registry of robots."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from xop_lerobot.command import ActionLayout, CommandSpace, Mode, RobotAction
+from xop_lerobot.registry import Registry
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from xop_lerobot.retarget.config import MpcConfig
+
+ModelKind = Literal["full", "planning"]
+
+
+@dataclass(frozen=True)
+class ArmChain:
+    """One arm of a robot.
+
+    Attributes:
+        frame: The tracked frame it carries, ``"left_wrist"``.
+        joints: Its joints from shoulder to wrist.
+        gripper: The name of its gripper target, None for a hand without one.
+        gripper_range: Opening of the gripper when closed and when open [m].
+    """
+
+    frame: str
+    joints: tuple[str, ...]
+    gripper: str | None = None
+    gripper_range: tuple[float, float] = (0.0, 0.0)
+
+
+class Morphology(ABC):
+    """A robot, as far as retargeting is concerned. One folder per robot, no other code knows it.
+
+    The full model is the plant: everything collides, cameras and visuals are there. The
+    planning model has the same joints and actuators in the same order, and only the contacts
+    that matter for the prediction.
+    """
+
+    name: str
+    command_space: CommandSpace
+    policies: tuple[str, ...]
+    """Low-level policies that fit this robot; the first is the default."""
+    frames: dict[str, str]
+    """Site that each tracked frame (`head`, `left_wrist`, `right_wrist`) is in the models."""
+    base_body: str
+    arms: tuple[ArmChain, ...]
+    arm_rest: dict[str, float]
+    """Rest angle of each arm joint [rad]; joints that are not named rest at 0."""
+    contact_points: tuple[str, ...]
+    """Sites of the points on which the robot stands (four a foot; one a wheel)."""
+    fall_height: float
+    """Base height over the ground under which the robot counts as fallen [m]."""
+    fall_tilt: float
+    """Tilt of the base over which the robot counts as fallen [rad]."""
+    wheeled: bool
+    """Whether it stands on wheels (contact points roll, the base stays level)."""
+
+    @abstractmethod
+    def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
+        """Build the robot alone, at its rest posture, as an editable model."""
+
+    @abstractmethod
+    def standing_qpos(self) -> np.ndarray:
+        """Generalised position at rest on the ground, facing +X at the origin. Shape (nq,)."""
+
+    @abstractmethod
+    def mpc_config(self, mode: Mode) -> MpcConfig:
+        """Parameters of the model predictive controller in `mode`."""
+
+    @cached_property
+    def arm_names(self) -> tuple[str, ...]:
+        """Arm joints of all chains, then the grippers: the order of every `arms` array."""
+        joints = [joint for arm in self.arms for joint in arm.joints]
+        return (*joints, *(arm.gripper for arm in self.arms if arm.gripper))
+
+    @cached_property
+    def layout(self) -> ActionLayout:
+        """How actions of this robot are laid out."""
+        return ActionLayout(self.command_space, self.arm_names)
+
+    def rest_action(self) -> RobotAction:
+        """Stand at rest: neutral command, stationary, arms at rest, grippers open."""
+        joints = [self.arm_rest.get(joint, 0.0) for arm in self.arms for joint in arm.joints]
+        grippers = [arm.gripper_range[1] for arm in self.arms if arm.gripper]
+        return RobotAction(
+            self.command_space.neutral.copy(), Mode.STATIONARY, np.array(joints + grippers)
+        )
+
+
+MORPHOLOGIES: Registry[type[Morphology]] = Registry("robot")
+
+
+def make_morphology(name: str) -> Morphology:
+    """Make the robot `name`.
+
+    Raises:
+        UnknownName: Listing the known robots.
+    """
+    from xop_lerobot.morphology import g1, rby1  # noqa: F401, PLC0415
+
+    return MORPHOLOGIES[name]()

@@ -1,0 +1,1 @@
+"""The person in the headset: frames, alignment, gestures and devices."""

@@ -1,0 +1,36 @@
+"""The interface of an XR device and the registry of devices."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from xop_lerobot.operator.frame import OperatorFrame
+
+
+class Device(ABC):
+    """A source of operator frames. Nothing behind it knows which device it was.
+
+    Attributes:
+        self_engaging: Whether the device engages by itself once the robot has settled
+            (recordings and scripts do; people use a gesture).
+    """
+
+    self_engaging: bool = False
+
+    def connect(self) -> None:
+        """Open the device; a file is read and checked here, before any robot moves."""
+
+    def disconnect(self) -> None:
+        """Close the device; may be called twice."""
+
+    def start(self, time: float) -> None:
+        """Start the device's own clock at `time` [s] of the robot's clock (at engage)."""
+
+    @abstractmethod
+    def read(self, time: float) -> OperatorFrame | None:
+        """Return the newest frame at `time` [s] of the robot's clock, None before the first."""
+
+    def is_finished(self, time: float) -> bool:
+        """Whether a recording or script has played out at `time`; people never finish."""
+        del time
+        return False

@@ -1,0 +1,1 @@
+"""The body behind one interface: simulated now, real robots later."""

@@ -1,0 +1,55 @@
+"""A name-to-thing table that refuses duplicates and lists the choices when a name is unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from xop_lerobot.errors import DuplicateName, UnknownName
+
+
+class Registry[T]:
+    """Things of one kind by name.
+
+    Args:
+        kind: What is registered, as it reads in an error (``"robot"``).
+    """
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self._things: dict[str, T] = {}
+
+    def add(self, name: str, thing: T) -> T:
+        """Register `thing` under `name`.
+
+        Raises:
+            DuplicateName: If the name is taken.
+        """
+        if name in self._things:
+            raise DuplicateName(self.kind, name)
+        self._things[name] = thing
+        return thing
+
+    def register(self, name: str) -> Callable[[T], T]:
+        """Return a decorator that registers what it decorates under `name`."""
+        return lambda thing: self.add(name, thing)
+
+    def remove(self, name: str) -> None:
+        """Forget `name` (tests register toys and take them away again)."""
+        self._things.pop(name, None)
+
+    def __getitem__(self, name: str) -> T:
+        """Look `name` up.
+
+        Raises:
+            UnknownName: Carrying every known name.
+        """
+        try:
+            return self._things[name]
+        except KeyError:
+            raise UnknownName(self.kind, name, self._things) from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._things
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted(self._things))

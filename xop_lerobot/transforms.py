@@ -1,0 +1,142 @@
+"""Poses and quaternions as arrays: pose = x y z qw qx qy qz [m, unit quaternion wxyz].
+
+All functions broadcast over leading dimensions, so a batch of rollouts costs one call.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+IDENTITY_POSE = np.array([0.0, 0, 0, 1, 0, 0, 0])
+IDENTITY_POSE.setflags(write=False)
+
+
+def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product a∘b. Shapes (..., 4), wxyz."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a, float), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b, float), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quat_conjugate(q: np.ndarray) -> np.ndarray:
+    """Inverse of a unit quaternion. Shape (..., 4), wxyz."""
+    return np.asarray(q, float) * np.array([1.0, -1, -1, -1])
+
+
+def quat_rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Rotate v (..., 3) by q (..., 4): v + 2w(u×v) + 2u×(u×v)."""
+    q, v = np.asarray(q, float), np.asarray(v, float)
+    u = q[..., 1:]
+    t = 2 * np.cross(u, v)
+    return v + q[..., :1] * t + np.cross(u, t)
+
+
+def quat_exp(rotvec: np.ndarray) -> np.ndarray:
+    """Quaternion of a rotation vector [rad]. Shape (..., 3) -> (..., 4), wxyz."""
+    rotvec = np.asarray(rotvec, float)
+    angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
+    # np.sinc(x) = sin(pi x)/(pi x) is smooth through zero.
+    return np.concatenate(
+        [np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotvec], axis=-1
+    )
+
+
+def quat_log(q: np.ndarray) -> np.ndarray:
+    """Rotation vector of a unit quaternion, angle in [0, pi] [rad]. Shape (..., 4) -> (..., 3)."""
+    q = np.asarray(q, float)
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0)
+    return scale * q[..., 1:]
+
+
+def quat_from_yaw(yaw: np.ndarray | float) -> np.ndarray:
+    """Rotation about world Z by `yaw` [rad]. Shape (...,) -> (..., 4)."""
+    half = np.asarray(yaw, float) / 2
+    zero = np.zeros_like(half)
+    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+
+
+def quat_yaw(q: np.ndarray) -> np.ndarray:
+    """Heading [rad] of the frame's X axis about world Z (Tait-Bryan ZYX). Shape (..., 4) -> (...)."""
+    w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def quat_to_rpy(q: np.ndarray) -> np.ndarray:
+    """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll). Shape (..., 4) -> (..., 3)."""
+    w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    return np.stack([roll, pitch, quat_yaw(q)], axis=-1)
+
+
+def quat_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Quaternion of R = Rz(yaw) Ry(pitch) Rx(roll) [rad]. Shape (4,)."""
+    yaw_pitch = quat_multiply(quat_from_yaw(yaw), quat_exp(np.array([0, pitch, 0])))
+    return quat_multiply(yaw_pitch, quat_exp(np.array([roll, 0, 0])))
+
+
+def quat_from_matrix(matrix: np.ndarray) -> np.ndarray:
+    """Unit quaternion of rotation matrices. Shape (..., 3, 3) -> (..., 4), wxyz, w >= 0.
+
+    The largest of the four squared components is computed from the diagonal and the others
+    from it, which is well conditioned everywhere (Shepperd's method).
+    """
+    m = np.asarray(matrix, float)
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    squares = np.stack([trace, m00, m11, m22], axis=-1)
+    a, b, c = (m[..., i, j] for i, j in ((2, 1), (0, 2), (1, 0)))
+    ta, tb, tc = (m[..., i, j] for i, j in ((1, 2), (2, 0), (0, 1)))
+    candidates = np.stack(
+        [
+            np.stack([1 + trace, a - ta, b - tb, c - tc], -1),
+            np.stack([a - ta, 1 + m00 - m11 - m22, c + tc, b + tb], -1),
+            np.stack([b - tb, c + tc, 1 - m00 + m11 - m22, a + ta], -1),
+            np.stack([c - tc, b + tb, a + ta, 1 - m00 - m11 + m22], -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)[..., None, None]
+    q = np.take_along_axis(candidates, np.broadcast_to(best, (*best.shape[:-1], 4)), -2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def make_pose(position: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Pose of position (..., 3) and quaternion (..., 4). Shape (..., 7)."""
+    return np.concatenate([np.asarray(position, float), np.asarray(quat, float)], axis=-1)
+
+
+def pose_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Composition T_a T_b. Shapes (..., 7)."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    position = a[..., :3] + quat_rotate(a[..., 3:], b[..., :3])
+    return make_pose(position, quat_multiply(a[..., 3:], b[..., 3:]))
+
+
+def pose_inverse(pose: np.ndarray) -> np.ndarray:
+    """Inverse T^-1. Shape (..., 7)."""
+    pose = np.asarray(pose, float)
+    quat = quat_conjugate(pose[..., 3:])
+    return make_pose(-quat_rotate(quat, pose[..., :3]), quat)
+
+
+def rotation_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Rotation vector log(q_goal q^-1) in world axes [rad]. Shapes (..., 4) -> (..., 3)."""
+    return quat_log(quat_multiply(goal, quat_conjugate(quat)))
+
+
+def wrap_angle(angle: np.ndarray | float) -> np.ndarray:
+    """Wrap to (-pi, pi] [rad]."""
+    return -((-np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi)
