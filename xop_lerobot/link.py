@@ -1,0 +1,129 @@
+"""Where the robot and the teleoperator of one process meet, keyed by session.
+
+LeRobot's loops hand the teleoperator no observation, and connect the two in either order.
+So the robot publishes here what it is (`announce`) and, in every `get_observation`, its state;
+the teleoperator looks both up when it needs them, and publishes what it did in the tick
+for the recorder. Publishing replaces one immutable value, so readers need no lock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from threading import Lock
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.errors import LinkError
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.state import Goal, RobotState
+
+if TYPE_CHECKING:
+    from xop_lerobot.morphology.morphology import Morphology
+
+
+@dataclass(frozen=True)
+class RobotInfo:
+    """What a teleoperator must know of its robot.
+
+    Attributes:
+        name: LeRobot's robot type, ``"xop_g1"``.
+        morphology: The robot's morphology.
+        low_level: Name of its low-level policy.
+        low_level_path: File of that policy, None for its default.
+        scene: Name of the scene it stands in.
+        fps: Rate of the control loop [Hz].
+        seed: Seed of its session.
+        realtime: Whether its clock is the wall clock.
+    """
+
+    name: str
+    morphology: Morphology
+    low_level: str
+    low_level_path: str | None
+    scene: str
+    fps: int
+    seed: int
+    realtime: bool = False
+
+
+@dataclass(frozen=True)
+class TickRecord:
+    """All that one tick of the teleoperator saw and decided; the recorder's only source.
+
+    Attributes:
+        state: The robot state that the tick started from.
+        frame: The operator's frame, None before the first.
+        goal: The goal, None while not engaged.
+        engaged: Whether the operator drives.
+        command: The retargeter's command a*, before limits. Shape (k,).
+        cost: Cost of the plan by term.
+        health: Figures on the plan's health by name (solve time, age, effective samples, …).
+        finished: Whether the device has played out.
+    """
+
+    state: RobotState
+    frame: OperatorFrame | None
+    goal: Goal | None
+    engaged: bool
+    command: np.ndarray
+    cost: Mapping[str, float]
+    health: Mapping[str, float]
+    finished: bool = False
+
+
+class Session:
+    """One robot and one teleoperator."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._lock = Lock()
+        self._robots: list[RobotInfo] = []
+        self.state: RobotState | None = None
+        self.tick: TickRecord | None = None
+        self.reset_count = 0
+        """Number of robot resets so far; a change tells the teleoperator to re-align."""
+
+    def announce(self, info: RobotInfo) -> None:
+        """Add the robot `info` to the session."""
+        with self._lock:
+            if not any(known is info for known in self._robots):
+                self._robots.append(info)
+
+    def withdraw(self, info: RobotInfo) -> None:
+        """Take the robot `info` out of the session; unknown ones are ignored."""
+        with self._lock:
+            self._robots = [known for known in self._robots if known is not info]
+            if not self._robots:
+                self.state = self.tick = None
+
+    @property
+    def robot(self) -> RobotInfo:
+        """The session's only robot.
+
+        Raises:
+            LinkError: If there is none, or more than one.
+        """
+        if not self._robots:
+            raise LinkError(
+                f"no xop robot in session '{self.name}'. Use --robot.type=xop_g1 or xop_rby1 with "
+                f"--robot.session={self.name}, the same as --teleop.session."
+            )
+        if len(self._robots) > 1:
+            names = ", ".join(info.name for info in self._robots)
+            raise LinkError(
+                f"{len(self._robots)} robots in session '{self.name}' ({names}); a teleoperator "
+                "drives one. Give each pair its own --robot.session and --teleop.session."
+            )
+        return self._robots[0]
+
+
+_SESSIONS: dict[str, Session] = {}
+_SESSIONS_LOCK = Lock()
+
+
+def get_session(name: str = "default") -> Session:
+    """Return the session `name`, made on first use."""
+    with _SESSIONS_LOCK:
+        return _SESSIONS.setdefault(name, Session(name))
