@@ -1,0 +1,116 @@
+"""Parameters of the retargeter; dataclasses only, so that a plugin can import them at once."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+
+from xop_lerobot.errors import BadValue, UnknownName
+
+WEIGHTINGS = ("raw", "minmax", "ess")
+RETARGETERS = ("mpc", "direct")
+
+
+@dataclass(frozen=True)
+class CostWeights:
+    """Weights of the cost terms (Eq. 3); docs/retargeter.md has the formulas.
+
+    Attributes:
+        position: w_p, squared position error of each tracked frame [1/m²].
+        orientation: w_θ, squared orientation error of each tracked frame [1/rad²].
+        stance: w_s, squared velocity of the points in contact [s²/m²].
+        collision: w_c, proximity to obstacles [1].
+        collision_velocity: w_v, speed near obstacles [s²/m²].
+        control: w_a, squared deviation of the command from its reference, each entry over its
+            scale [1].
+        terminal: w_f, factor on the tracking cost at the end of the horizon [1].
+        fall: Squared tilt of the base over the safe one, and height under it [1].
+    """
+
+    position: float = 1.0
+    orientation: float = 0.1
+    stance: float = 0.01
+    collision: float = 1.0
+    collision_velocity: float = 1.0
+    control: float = 0.002
+    terminal: float = 2.0
+    fall: float = 100.0
+
+
+@dataclass(frozen=True)
+class MpcConfig:
+    """Model predictive controller of one robot in one mode.
+
+    Attributes:
+        num_samples: Rollouts per solve N, fixed candidates included [1].
+        horizon: Length H of a rollout in low-level control steps of 20 ms [1].
+        num_knots: Support points of the kernel interpolation [1].
+        kernel_width: Width σ of the kernel [control steps].
+        noise_std: Standard deviation of the samples by command name [its unit].
+        temperature: λ of weighting `raw` [cost], or of `minmax` [share of the cost's range].
+        effective_samples: Effective sample size that weighting `ess` aims at [1].
+        weighting: How costs become weights: `raw`, `minmax` or `ess`.
+        min_noise: Share of `noise_std` that is left when the robot is at its goal [1].
+        full_noise_error: Tracking error at which the noise is full [m, rad].
+        control_hz: Solves per second of the robot's clock [Hz].
+        preview_s: Time over which a goal is assumed to keep its velocity [s].
+        extrapolation_s: Time over which the terminal state is extrapolated [s].
+        proposal_s: Time in which the kinematic candidate wants to be at the goal [s].
+        weights: Cost weights.
+    """
+
+    num_samples: int
+    horizon: int
+    noise_std: dict[str, float]
+    num_knots: int = 1
+    kernel_width: float = 2.0
+    temperature: float = 0.05
+    effective_samples: float = 4.0
+    weighting: str = "ess"
+    min_noise: float = 0.15
+    full_noise_error: float = 0.2
+    control_hz: float = 25.0
+    preview_s: float = 0.3
+    extrapolation_s: float = 0.4
+    proposal_s: float = 0.6
+    weights: CostWeights = field(default_factory=CostWeights)
+
+    def __post_init__(self) -> None:
+        if self.weighting not in WEIGHTINGS:
+            raise UnknownName("weighting", self.weighting, WEIGHTINGS)
+        for name in ("num_samples", "horizon", "num_knots"):
+            if getattr(self, name) < 1:
+                raise BadValue(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+@dataclass
+class RetargeterConfig:
+    """Which retargeter drives the robot, as set from the command line.
+
+    Attributes:
+        type: `mpc`, or `direct` for the paper's direct-mapping baseline.
+        num_samples: Rollouts per solve; 0 takes the robot's own default.
+        horizon: Rollout length in control steps; 0 takes the robot's own default.
+        control_hz: Solves per second; 0 takes the robot's own default.
+        threads: Threads for the rollouts; 0 takes one per core.
+        seed: Seed of the samples.
+    """
+
+    type: str = "mpc"
+    num_samples: int = 0
+    horizon: int = 0
+    control_hz: float = 0.0
+    threads: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.type not in RETARGETERS:
+            raise UnknownName("retargeter", self.type, RETARGETERS)
+        for name in ("num_samples", "horizon", "control_hz", "threads"):
+            if getattr(self, name) < 0:
+                raise BadValue(f"{name} must not be negative, got {getattr(self, name)}")
+
+    @property
+    def num_threads(self) -> int:
+        """Threads for the rollouts."""
+        return self.threads or len(os.sched_getaffinity(0))

@@ -1,0 +1,122 @@
+"""Prediction: MuJoCo with the low-level policy in the loop, for a batch of command sequences."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import NamedTuple
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadValue
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+
+
+class Prediction(NamedTuple):
+    """What a batch of rollouts gave.
+
+    Attributes:
+        qpos: Positions at each control step, the first is the start. Shape (K, H + 1, nq).
+        qvel: Velocities at each control step. Shape (K, H + 1, nv).
+        commands: The commands that were rolled out. Shape (K, H, k).
+        policy_s: Time in the low-level policy [s].
+        physics_s: Time in MuJoCo [s].
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    commands: np.ndarray
+    policy_s: float
+    physics_s: float
+
+
+class PolicyRollout:
+    """Rolls command sequences out in parallel, one policy call per control step (Eqs. 1b, 1c).
+
+    The thread pool lives as long as the object; results do not depend on its size.
+
+    Args:
+        model: Planning model.
+        policy: Low-level policy.
+        num_threads: Threads of the physics.
+
+    Raises:
+        BadValue: If 20 ms is not a whole multiple of the model's time step.
+    """
+
+    def __init__(self, model: mujoco.MjModel, policy: LowLevelPolicy, num_threads: int) -> None:
+        self.model, self.policy = model, policy
+        self.substeps = round(POLICY_DT / model.opt.timestep)
+        if abs(self.substeps * model.opt.timestep - POLICY_DT) > 1e-9:  # noqa: PLR2004
+            raise BadValue(
+                f"the policy period {POLICY_DT} s must be a whole multiple of the time step "
+                f"{model.opt.timestep} s"
+            )
+        # One thread means the caller's own: a pool of one would only add a hand-over.
+        self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
+        self._data = [mujoco.MjData(model) for _ in range(max(num_threads, 1))]
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self._pool.close()
+
+    def predict(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        memory: np.ndarray,
+        commands: np.ndarray,
+        arms: np.ndarray,
+        mode: Mode,
+    ) -> Prediction:
+        """Roll `commands` out from one start state and one policy memory (Eqs. 1e, 1f).
+
+        Args:
+            qpos: Start position. Shape (nq,).
+            qvel: Start velocity. Shape (nv,).
+            memory: The policy's memory h at the start. Shape (nm,).
+            commands: Command sequences. Shape (K, H, k).
+            arms: Arm and gripper targets, held. Shape (m,).
+            mode: Mode of the low-level policy.
+
+        Returns:
+            The predicted states.
+        """
+        nq, nv = self.model.nq, self.model.nv
+        num_rollouts, horizon, _ = commands.shape
+        state = np.zeros((num_rollouts, 1 + nq + nv + self.model.na))
+        state[:, 1 : 1 + nq], state[:, 1 + nq : 1 + nq + nv] = qpos, qvel
+        out = np.empty((num_rollouts, self.substeps, state.shape[1]))
+        states = np.empty((num_rollouts, horizon + 1, state.shape[1]))
+        states[:, 0] = state
+        memory = np.broadcast_to(memory, (num_rollouts, len(memory)))
+        arms = np.broadcast_to(arms, (num_rollouts, len(arms)))
+        policy_s = physics_s = 0.0
+        for step in range(horizon):
+            start = perf_counter()
+            targets, memory = self.policy.act(
+                states[:, step, 1 : 1 + nq],
+                states[:, step, 1 + nq : 1 + nq + nv],
+                commands[:, step],
+                arms,
+                memory,
+                mode,
+            )
+            between = perf_counter()
+            self._pool.rollout(
+                self.model,
+                self._data,
+                states[:, step],
+                targets[:, None],
+                nstep=self.substeps,
+                state=out,
+            )
+            states[:, step + 1] = out[:, -1]
+            end = perf_counter()
+            policy_s += between - start
+            physics_s += end - between
+        return Prediction(
+            states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + nv], commands, policy_s, physics_s
+        )
