@@ -40,22 +40,21 @@ class SiteKinematics:
 
     def __init__(self, model: mujoco.MjModel, sites: tuple[str, ...]) -> None:
         known = [model.site(i).name for i in range(model.nsite)]
-        for site in sites:
-            if site not in known:
-                raise UnknownName("site", site, known)
-        self.sites = sites
-        self._chains: dict[str, tuple[list[_Link], np.ndarray, np.ndarray]] = {}
+        self._ends: dict[str, tuple[list[_Link], np.ndarray, np.ndarray]] = {}
         links: dict[int, _Link] = {}
         for name in sites:
+            if name not in known:
+                raise UnknownName("site", name, known)
             site = model.site(name)
             chain = _make_chain(model, int(site.bodyid[0]), links)
-            self._chains[name] = (chain, site.pos.copy(), site.quat.copy())
+            self._ends[name] = (chain, site.pos.copy(), site.quat.copy())
 
-    def compute_poses(self, qpos: np.ndarray) -> dict[str, np.ndarray]:
-        """World pose of every site, x y z qw qx qy qz. Shape (..., nq) -> (..., 7) each."""
+    def compute_poses(self, qpos: np.ndarray, sites: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+        """World poses x y z qw qx qy qz of `sites`, of all by default. (..., nq) -> (..., 7)."""
         bodies: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         poses = {}
-        for name, (chain, site_pos, site_quat) in self._chains.items():
+        for name in sites or self._ends:
+            chain, site_pos, site_quat = self._ends[name]
             pos = np.zeros((*qpos.shape[:-1], 3))
             quat = np.broadcast_to(np.array([1.0, 0, 0, 0]), (*qpos.shape[:-1], 4))
             for link in chain:
@@ -63,7 +62,9 @@ class SiteKinematics:
                 if key not in bodies:
                     bodies[key] = _move(link, qpos, pos, quat)
                 pos, quat = bodies[key]
-            poses[name] = make_pose(pos + quat_rotate(quat, site_pos), quat_multiply(quat, site_quat))
+            poses[name] = make_pose(
+                pos + quat_rotate(quat, site_pos), quat_multiply(quat, site_quat)
+            )
         return poses
 
 

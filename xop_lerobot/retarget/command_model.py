@@ -1,0 +1,107 @@
+"""What a command does, to first order: the cheap model behind proposals and the cost-to-go."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.command import CommandSpace, Mode
+from xop_lerobot.transforms import quat_from_yaw, quat_multiply, quat_yaw
+
+
+class Acts(Enum):
+    """On what an entry of a command acts."""
+
+    HEIGHT = "height of the base over the ground"
+    JOINT = "angle of a joint"
+    FORWARD = "velocity of the base along its heading"
+    LEFT = "velocity of the base across its heading"
+    TURN = "yaw rate of the base"
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Effect of one entry of a command.
+
+    Attributes:
+        acts: On what it acts.
+        joint: The joint, where it acts on one.
+        lag_s: Time constant with which height or joint follow the command [s].
+        modes: Modes in which it has an effect at all.
+    """
+
+    acts: Acts
+    joint: str = ""
+    lag_s: float = 0.15
+    modes: tuple[Mode, ...] = (Mode.STATIONARY, Mode.MOBILE)
+
+
+class CommandModel:
+    r"""Extrapolates a configuration under a command held for a time.
+
+    The base moves with the commanded twist around its pivot; height and joints follow with a
+    first-order lag, :math:`q(t) = q + (a - q)(1 - e^{-t/T})`; all else stays. It knows neither
+    balance nor contacts: it only ranks and proposes, the rollout in MuJoCo decides.
+
+    Args:
+        model: The robot's model.
+        space: Its command space.
+        effects: One effect for each entry of the command.
+        pivot: Forward distance from the base's frame to its centre of turning [m].
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        space: CommandSpace,
+        effects: tuple[Effect, ...],
+        pivot: float = 0.0,
+    ) -> None:
+        self.space, self.effects, self.pivot = space, effects, pivot
+        self._address = [
+            int(model.joint(effect.joint).qposadr[0]) if effect.joint else 2 for effect in effects
+        ]
+
+    def acting(self, mode: Mode) -> np.ndarray:
+        """Which entries have an effect in `mode`. Shape (k,), bool."""
+        acts = np.array([mode in effect.modes for effect in self.effects])
+        return acts & ~(self.space.mobile_only & (mode == Mode.STATIONARY))
+
+    def is_velocity(self) -> np.ndarray:
+        """Which entries are velocities of the base. Shape (k,), bool."""
+        return np.array([e.acts in (Acts.FORWARD, Acts.LEFT, Acts.TURN) for e in self.effects])
+
+    def extrapolate(
+        self, qpos: np.ndarray, command: np.ndarray, dt: float, mode: Mode
+    ) -> np.ndarray:
+        """Configuration after `dt` [s] of `command`. Shapes (..., nq), (..., k) -> (..., nq)."""
+        shape = np.broadcast_shapes(qpos.shape[:-1], command.shape[:-1])
+        result = np.broadcast_to(qpos, (*shape, qpos.shape[-1])).copy()
+        forward = left = turn = np.zeros(shape)
+        for i, (effect, acts) in enumerate(zip(self.effects, self.acting(mode), strict=True)):
+            if not acts:
+                continue
+            value = command[..., i]
+            if effect.acts is Acts.FORWARD:
+                forward = value
+            elif effect.acts is Acts.LEFT:
+                left = value
+            elif effect.acts is Acts.TURN:
+                turn = value
+            else:
+                share = 1 - np.exp(-dt / effect.lag_s)
+                address = self._address[i]
+                result[..., address] += share * (value - result[..., address])
+        yaw = quat_yaw(result[..., 3:7])
+        middle = yaw + turn * dt / 2  # heading halfway: the chord of the arc
+        x, y = np.cos(middle), np.sin(middle)
+        result[..., 0] += dt * (forward * x - left * y)
+        result[..., 1] += dt * (forward * y + left * x)
+        if self.pivot:
+            result[..., 0] += self.pivot * (np.cos(yaw) - np.cos(yaw + turn * dt))
+            result[..., 1] += self.pivot * (np.sin(yaw) - np.sin(yaw + turn * dt))
+        result[..., 3:7] = quat_multiply(quat_from_yaw(turn * dt), result[..., 3:7])
+        return result

@@ -1,0 +1,146 @@
+"""The kinematic proposal: the command that would reach the goal if the robot were ideal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.transforms import rotation_error
+
+_STEP = 1e-4  # finite-difference step, in shares of a command's scale
+
+
+@dataclass(frozen=True)
+class ProposalWeights:
+    """Weights of the proposal's least squares.
+
+    Attributes:
+        position: Of the position error along x, y, z [1/m].
+        orientation: Of the orientation error about x, y, z [1/rad].
+        effort: Of the command's distance from neutral, over its scale [1].
+    """
+
+    position: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    orientation: tuple[float, float, float] = (0.4, 0.4, 0.4)
+    effort: float = 0.02
+
+
+class KinematicProposal:
+    r"""Solves :math:`\min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \rho^2\|(a - a_0)/s\|^2`.
+
+    φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` the neutral
+    command and s half the range of each entry. A few damped Gauss-Newton steps within the
+    bounds; the Jacobian by finite differences, all columns in one batch.
+
+    Args:
+        command_model: What a command does.
+        kinematics: Kinematics of the tracked frames' sites.
+        sites: Site of each tracked frame.
+        weights: Weights of the errors.
+        iterations: Number of Gauss-Newton steps.
+    """
+
+    def __init__(
+        self,
+        command_model: CommandModel,
+        kinematics: SiteKinematics,
+        sites: Mapping[str, str],
+        weights: ProposalWeights | None = None,
+        iterations: int = 4,
+    ) -> None:
+        self.command_model, self.kinematics, self.sites = command_model, kinematics, dict(sites)
+        self.weights = weights or ProposalWeights()
+        self.iterations = iterations
+        space = command_model.space
+        self.scale = (space.high - space.low) / 2
+
+    def solve(
+        self,
+        qpos: np.ndarray,
+        goals: Mapping[str, np.ndarray],
+        mode: Mode,
+        dt: float,
+        *,
+        start: np.ndarray | None = None,
+        free: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Compute the proposed command.
+
+        Args:
+            qpos: Configuration now. Shape (nq,).
+            goals: Pose wanted after `dt` for each tracked frame. Shapes (7,).
+            mode: Mode of the robot; entries without effect in it stay neutral.
+            dt: Time to get there [s].
+            start: Where to start the iteration; neutral by default. Shape (k,).
+            free: Which entries may move; all that act by default. Shape (k,), bool.
+
+        Returns:
+            Command within the bounds. Shape (k,).
+        """
+        space = self.command_model.space
+        free = self.command_model.acting(mode) if free is None else free
+        index = np.flatnonzero(free)
+        command = np.where(free, space.neutral if start is None else start, space.neutral)
+        if not len(index) or not goals:
+            return command
+        low, high = space.low[index], space.high[index]
+        scale = self.scale[index]
+        for _ in range(self.iterations):
+            batch = np.tile(command, (len(index) + 1, 1))
+            batch[np.arange(1, len(index) + 1), index] += _STEP * scale
+            residuals = self._compute_residuals(qpos, batch, goals, mode, dt)
+            jacobian = (residuals[1:] - residuals[0]).T / _STEP  # per share of scale
+            pull = self.weights.effort * (command[index] - space.neutral[index]) / scale
+            matrix = jacobian.T @ jacobian + (self.weights.effort**2 + 1e-6) * np.eye(len(index))
+            gradient = jacobian.T @ residuals[0] + self.weights.effort * pull
+            step = _solve_in_box(
+                matrix, gradient, (low - command[index]) / scale, (high - command[index]) / scale
+            )
+            command = command.copy()
+            command[index] = np.clip(command[index] + scale * step, low, high)
+        return command
+
+    def _compute_residuals(
+        self,
+        qpos: np.ndarray,
+        commands: np.ndarray,
+        goals: Mapping[str, np.ndarray],
+        mode: Mode,
+        dt: float,
+    ) -> np.ndarray:
+        """Weighted pose errors of a batch of commands. Shape (n, 6 · frames)."""
+        future = self.command_model.extrapolate(qpos, commands, dt, mode)
+        poses = self.kinematics.compute_poses(future, tuple(self.sites[name] for name in goals))
+        parts = []
+        for name, goal in goals.items():
+            pose = poses[self.sites[name]]
+            parts.append((pose[:, :3] - goal[:3]) * self.weights.position)
+            parts.append(-rotation_error(goal[3:], pose[:, 3:]) * self.weights.orientation)
+        return np.concatenate(parts, axis=1)
+
+
+def _solve_in_box(
+    matrix: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Minimise x'Hx/2 + g'x over low <= x <= high by fixing violated entries, worst first."""
+    x = np.zeros(len(gradient))
+    fixed = np.zeros(len(gradient), dtype=bool)
+    for _ in range(len(gradient)):
+        free = ~fixed
+        if not free.any():
+            break
+        rhs = -gradient[free] - matrix[np.ix_(free, fixed)] @ x[fixed]
+        x[free] = np.linalg.solve(matrix[np.ix_(free, free)], rhs)
+        excess = np.maximum(low - x, x - high)
+        excess[fixed] = 0
+        worst = int(np.argmax(excess))
+        if excess[worst] <= 1e-12:  # noqa: PLR2004
+            break
+        x[worst] = np.clip(x[worst], low[worst], high[worst])
+        fixed[worst] = True
+    return np.clip(x, low, high)
