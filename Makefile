@@ -1,0 +1,48 @@
+# Everything starts here, and nothing has to be installed before: `make demo` or `make test`.
+# The first run makes .venv (see docs/setup.md); later runs start at once.
+
+VENV := .venv
+PYTHON := $(VENV)/bin/python
+SOURCES := xop_lerobot robots teleoperators scripts tests
+
+# Render without a display. One BLAS thread each: the planner brings its own threads.
+export MUJOCO_GL ?= egl
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test format lint type check lock clean
+
+help:  ## Show the verbs
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
+
+setup:  ## Make .venv and install the project (the other verbs do it by themselves)
+	@sh scripts/setup.sh
+
+demo: setup  ## Record and show one episode of each robot, in outputs/demo
+	@$(PYTHON) scripts/demo.py
+
+test: setup  ## Lint, then run the tests
+	@$(PYTHON) -m ruff check --quiet $(SOURCES)
+	@$(PYTHON) -m pytest -q
+
+format: setup  ## Format the code and apply the linter's safe fixes
+	@$(PYTHON) -m ruff format $(SOURCES)
+	@$(PYTHON) -m ruff check --fix $(SOURCES)
+
+lint: setup  ## Check lint and format, change nothing
+	@$(PYTHON) -m ruff check $(SOURCES)
+	@$(PYTHON) -m ruff format --check $(SOURCES)
+
+type: setup  ## Check the types (pyright fetches Node.js the first time)
+	@$(PYTHON) -m pyright
+
+check: lint type test  ## Everything that a change must pass
+
+lock: setup  ## Write the versions installed in .venv to requirements.lock
+	@$(PYTHON) scripts/setup.py --write-lock
+
+clean:  ## Remove .venv, caches and builds; recordings in outputs/ stay
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +
