@@ -1,0 +1,20 @@
+"""Cost terms of the controller, one file each (Eq. 3)."""
+
+from xop_lerobot.retarget.costs.collision import CollisionCost
+from xop_lerobot.retarget.costs.control import ControlCost
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.retarget.costs.fall import FallCost
+from xop_lerobot.retarget.costs.stance import StanceCost
+from xop_lerobot.retarget.costs.terminal import TerminalCost
+from xop_lerobot.retarget.costs.tracking import TrackingCost
+
+__all__ = [
+    "CollisionCost",
+    "ControlCost",
+    "Cost",
+    "Evaluation",
+    "FallCost",
+    "StanceCost",
+    "TerminalCost",
+    "TrackingCost",
+]

@@ -1,0 +1,28 @@
+"""Control energy cost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+
+
+class ControlCost(Cost):
+    r"""Mean over steps of :math:`w_a\|(a_k - a_{ref})/s\|^2`, s half the range of each entry.
+
+    With the absolute command of the paper the term pulls a standing height towards zero; with
+    the kinematic proposal as reference it costs only what is done beyond it.
+
+    Args:
+        scale: Half the range of each command entry. Shape (k,).
+    """
+
+    name = "control"
+
+    def __init__(self, scale: np.ndarray) -> None:
+        self.scale = scale
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        effort = (evaluation.commands - evaluation.reference) / self.scale
+        return evaluation.weights.control * np.square(effort).sum(-1).mean(-1)

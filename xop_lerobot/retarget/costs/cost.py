@@ -1,0 +1,56 @@
+"""The interface of a cost term and what it is given."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.retarget.config import CostWeights
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A batch of predictions to be scored.
+
+    Attributes:
+        qpos: Predicted positions; step 0 is the start. Shape (K, H + 1, nq).
+        qvel: Predicted velocities. Shape (K, H + 1, nv).
+        commands: Commands rolled out. Shape (K, H, k).
+        reference: The command that costs nothing. Shape (k,).
+        poses: Predicted pose of every site in use. Shapes (K, H + 1, 7).
+        goals: Goal of each tracked frame at every step. Shapes (H + 1, 7).
+        terminal_poses: Pose of each tracked frame at the end of the extrapolation. (K, 7).
+        terminal_goals: Goal of each tracked frame then. Shapes (7,).
+        sites: Site of each tracked frame.
+        mode: Mode of the robot.
+        dt: Time between steps [s].
+        weights: The weights.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    commands: np.ndarray
+    reference: np.ndarray
+    poses: Mapping[str, np.ndarray]
+    goals: Mapping[str, np.ndarray]
+    terminal_poses: Mapping[str, np.ndarray]
+    terminal_goals: Mapping[str, np.ndarray]
+    sites: Mapping[str, str]
+    mode: Mode
+    dt: float
+    weights: CostWeights
+
+
+class Cost(ABC):
+    """One term of the cost. Sums over a horizon are means over its steps, so that a weight
+    means the same for every horizon."""
+
+    name: str
+
+    @abstractmethod
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample, its weight included. Shape (K,)."""

@@ -1,0 +1,37 @@
+"""Fall cost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.transforms import quat_rotate
+
+
+class FallCost(Cost):
+    r"""Mean over steps of :math:`w_{fall}(\max(0, \alpha - \alpha_s)^2 + \max(0, z_s - z)^2)`.
+
+    α is the tilt of the base and z its height; the safe values are those at which half the
+    margin to a fall is used up. It is zero in ordinary motion. The paper has no such term; its
+    predicted falls show up in the tracking cost alone.
+
+    Args:
+        tilt: Tilt at which the robot counts as fallen [rad].
+        height: Base height under which it counts as fallen [m].
+        standing_height: Base height at rest [m].
+    """
+
+    name = "fall"
+
+    def __init__(self, tilt: float, height: float, standing_height: float) -> None:
+        self.safe_tilt = tilt / 2
+        self.safe_height = height + (standing_height - height) / 4
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        base = evaluation.qpos[:, 1:, :7]
+        up = quat_rotate(base[..., 3:], np.array([0.0, 0, 1]))[..., 2]
+        tilt = np.arccos(np.clip(up, -1, 1))
+        excess = np.square(np.maximum(0, tilt - self.safe_tilt))
+        excess += np.square(np.maximum(0, self.safe_height - base[..., 2]))
+        return evaluation.weights.fall * excess.mean(axis=1)

@@ -1,0 +1,46 @@
+"""Contact point cost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+
+
+class StanceCost(Cost):
+    r"""Mean over steps of :math:`w_s \sum_{i \in C_k} \|\dot p^c_{i,k}\|^2`.
+
+    The velocity of a contact point is its displacement over one control step. Points come in
+    groups that touch the ground together (the four of a foot); each group counts by the mean of
+    its points. C holds every group in stationary mode, and in mobile mode the lowest group of
+    each step, the standing foot. On wheels, which must roll, only stationary mode counts.
+
+    Args:
+        groups: Sites of each group of contact points.
+        wheeled: Whether the robot stands on wheels.
+    """
+
+    name = "stance"
+
+    def __init__(self, groups: tuple[tuple[str, ...], ...], wheeled: bool) -> None:
+        self.groups, self.wheeled = groups, wheeled
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        if self.wheeled and evaluation.mode is Mode.MOBILE:
+            return np.zeros(len(evaluation.qpos))
+        points = np.stack(
+            [
+                np.stack([evaluation.poses[site][..., :3] for site in group], axis=-2)
+                for group in self.groups
+            ]
+        )  # (groups, K, H + 1, points, 3)
+        speed = np.square(np.diff(points, axis=2) / evaluation.dt).sum(-1).mean(-1)
+        if evaluation.mode is Mode.STATIONARY:
+            active = speed.sum(axis=0)
+        else:
+            height = points[:, :, 1:, :, 2].mean(-1)
+            lowest = height.argmin(axis=0)[None]
+            active = np.take_along_axis(speed, lowest, axis=0)[0]
+        return evaluation.weights.stance * active.mean(axis=1)

@@ -1,0 +1,37 @@
+"""Goal tracking cost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.retarget.config import CostWeights
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+
+
+class TrackingCost(Cost):
+    r"""Mean over steps of :math:`\sum_f w_p\|p - p^d\|^2 + w_\theta\,d(\theta, \theta^d)^2`.
+
+    p, θ are the predicted position and orientation of a tracked frame, d the angle between two
+    orientations. The paper writes it for the base pose; a frame anywhere on the body includes it.
+    """
+
+    name = "tracking"
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        total = np.zeros(len(evaluation.qpos))
+        for name, goals in evaluation.goals.items():
+            poses = evaluation.poses[evaluation.sites[name]][:, 1:]
+            total += compute_tracking(poses, goals[1:], evaluation.weights).mean(axis=1)
+        return total
+
+
+def compute_tracking(poses: np.ndarray, goals: np.ndarray, weights: CostWeights) -> np.ndarray:
+    r"""Weighted squared error of poses. Shapes (..., 7) and (..., 7) -> (...).
+
+    The angle comes from :math:`|q \cdot q^d| = \cos(\alpha/2)`, which needs no quaternion product.
+    """
+    position = np.square(poses[..., :3] - goals[..., :3]).sum(-1)
+    cosine = np.minimum(np.abs((poses[..., 3:] * goals[..., 3:]).sum(-1)), 1.0)
+    angle = 2 * np.arccos(cosine)
+    return weights.position * position + weights.orientation * np.square(angle)

@@ -1,0 +1,73 @@
+"""What a retargeter returns, and the interface of retargeters."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.state import Goal, RobotState
+
+
+class Status(IntEnum):
+    """How a solve ended."""
+
+    OK = 0
+    DIVERGED = 1
+    """No sample had a finite cost: the plan holds the last command."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A retargeter's answer.
+
+    Attributes:
+        command: Command to execute now, before limits. Shape (k,).
+        commands: The planned sequence, one for each control step. Shape (H, k).
+        mode: The mode it is for.
+        qpos: Predicted positions under the plan's best sample; empty for `direct`. (H + 1, nq).
+        cost: Cost of the best sample by term.
+        status: How the solve ended.
+        effective_samples: Effective sample size of the update [1].
+        timings: Time spent, by part [s]; ``"solve"`` is the whole.
+    """
+
+    command: np.ndarray
+    commands: np.ndarray
+    mode: Mode
+    qpos: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    cost: Mapping[str, float] = field(default_factory=dict)
+    status: Status = Status.OK
+    effective_samples: float = 1.0
+    timings: Mapping[str, float] = field(default_factory=dict)
+
+
+class Retargeter(ABC):
+    """Turns a goal into commands for the low-level policy.
+
+    Attributes:
+        cost_names: Names of the cost terms of its plans, in order.
+        frames: The tracked frames it drives; the arms' inverse kinematics follow the others.
+    """
+
+    cost_names: tuple[str, ...] = ()
+    frames: tuple[str, ...] = ("head",)
+
+    @abstractmethod
+    def reset(self, state: RobotState) -> None:
+        """Forget all plans; the next one starts from the command that `state` executes."""
+
+    @abstractmethod
+    def plan(self, state: RobotState, goal: Goal) -> Plan:
+        """Compute the plan from `state` towards `goal`."""
+
+    @abstractmethod
+    def control_period(self, mode: Mode) -> float:
+        """Time between two plans in `mode` [s]."""
+
+    def close(self) -> None:
+        """Release threads; may be called twice."""
