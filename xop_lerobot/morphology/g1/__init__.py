@@ -1,0 +1,95 @@
+"""Unitree G1 with 29 degrees of freedom, in the revision that FALCON was trained on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.command import CommandDim, CommandSpace, Mode
+from xop_lerobot.morphology.g1.links import LINKS
+from xop_lerobot.morphology.g1.shapes import FOOT_POINTS
+from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from xop_lerobot.retarget.config import MpcConfig
+
+ARM_JOINTS = (
+    "shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow",
+    "wrist_roll", "wrist_pitch", "wrist_yaw",
+)  # fmt: skip
+
+STANDING = {"hip_pitch": -0.1, "knee": 0.3, "ankle_pitch": -0.2}
+"""FALCON's default leg angles [rad]; every other joint but the arms' stands at 0."""
+
+STANDING_HEIGHT = 0.7836
+"""Pelvis height at which the contact spheres bear the robot's weight at `STANDING` [m]."""
+
+ARM_REST = {"shoulder_pitch": 0.0, "shoulder_roll": 0.1, "elbow": 0.2}
+"""Rest angles of the left arm [rad]: elbows at the sides, forearms forward, palms inward."""
+
+
+def _mirrored(side: str, joint: str, angle: float) -> float:
+    """Return a left-arm angle as it reads on `side`: roll and yaw change sign on the right."""
+    return -angle if side == "right" and joint.endswith(("roll", "yaw")) else angle
+
+
+@MORPHOLOGIES.register("g1")
+class G1(Morphology):
+    """G1: a biped whose legs and waist a whole-body policy drives."""
+
+    name = "g1"
+    command_space = CommandSpace(
+        (
+            CommandDim("height", "height.pos", "m", 0.50, 0.78, 0.75, 0.5),
+            CommandDim("waist_yaw", "waist_yaw.pos", "rad", -1.0, 1.0, 0.0, 2.0),
+            CommandDim("waist_roll", "waist_roll.pos", "rad", -0.5, 0.5, 0.0, 2.0),
+            CommandDim("waist_pitch", "waist_pitch.pos", "rad", -0.5, 0.5, 0.0, 2.0),
+            CommandDim("vx", "x.vel", "m/s", -1.0, 1.0, 0.0, 3.0, mobile_only=True),
+            CommandDim("vy", "y.vel", "m/s", -0.6, 0.6, 0.0, 3.0, mobile_only=True),
+            CommandDim("yaw_rate", "theta.vel", "rad/s", -1.0, 1.0, 0.0, 5.0, mobile_only=True),
+        )
+    )
+    policies = ("default", "falcon")
+    frames = {"head": "head", "left_wrist": "left_wrist", "right_wrist": "right_wrist"}
+    base_body = "pelvis"
+    arms = tuple(
+        ArmChain(f"{side}_wrist", tuple(f"{side}_{joint}_joint" for joint in ARM_JOINTS))
+        for side in ("left", "right")
+    )
+    arm_rest = {
+        f"{side}_{joint}_joint": _mirrored(side, joint, angle)
+        for side in ("left", "right")
+        for joint, angle in ARM_REST.items()
+    }
+    contact_points = tuple(
+        f"{side}_foot_{i}" for side in ("left", "right") for i in range(len(FOOT_POINTS))
+    )
+    fall_height = 0.35
+    fall_tilt = 0.8
+    wheeled = False
+
+    def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
+        """Build G1 alone."""
+        from xop_lerobot.morphology.g1.model import build_g1  # noqa: PLC0415
+
+        return build_g1(kind)
+
+    def standing_qpos(self) -> np.ndarray:
+        """Stand on the ground at the origin: free joint, then the joints in order. Shape (36,)."""
+        angles = []
+        for link in LINKS:
+            if link.joint is None:
+                continue
+            name = link.joint.name
+            kind = name.removesuffix("_joint").removeprefix("left_").removeprefix("right_")
+            angles.append(self.arm_rest.get(name, STANDING.get(kind, 0.0)))
+        return np.array([0.0, 0, STANDING_HEIGHT, 1, 0, 0, 0, *angles])
+
+    def mpc_config(self, mode: Mode) -> MpcConfig:
+        """Parameters of the model predictive controller in `mode`."""
+        from xop_lerobot.morphology.g1.mpc import mpc_config  # noqa: PLC0415
+
+        return mpc_config(mode)

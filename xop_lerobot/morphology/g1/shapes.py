@@ -1,0 +1,143 @@
+"""G1: the primitives that make its looks and its collisions, its cameras and its named frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from xop_lerobot.morphology.links import Frame, Shape
+
+MATERIALS = {
+    "shell": (0.86, 0.87, 0.88, 0.3),
+    "grey": (0.46, 0.47, 0.49, 0.2),
+    "dark": (0.13, 0.13, 0.14, 0.2),
+    "visor": (0.03, 0.03, 0.05, 0.9),
+    "light": (0.45, 0.75, 0.95, 0.1),
+}
+"""Red, green, blue, gloss."""
+
+
+def mirror(shape: Shape) -> Shape:
+    """Return the right-hand twin of a left-hand shape (y to -y)."""
+    x, y, z = shape.pos
+    roll, pitch, yaw = shape.rpy
+    ends = shape.ends
+    return replace(
+        shape,
+        link=shape.link.replace("left", "right"),
+        name=shape.name.replace("left", "right"),
+        pos=(x, -y, z),
+        rpy=(-roll, pitch, -yaw),
+        ends=ends and (ends[0], -ends[1], ends[2], ends[3], -ends[4], ends[5]),
+    )
+
+
+def look(link: str, kind: str, size: tuple[float, ...], material: str, **where: object) -> Shape:
+    """Return a shape that is seen and collides with nothing."""
+    return Shape(link, kind, size, material=material, collides=False, **where)
+
+
+BODY = (
+    Shape("pelvis", "ellipsoid", (0.07, 0.085, 0.065), (0, 0, -0.075), material="grey"),
+    Shape("torso_link", "box", (0.055, 0.09, 0.085), (0.004, 0, 0.195), material="shell"),
+    Shape("torso_link", "box", (0.045, 0.055, 0.055), (0.002, 0, 0.075), material="dark"),
+    Shape(
+        "torso_link", "capsule", (0.062,), ends=(0.008, 0, 0.385, 0.008, 0, 0.425), material="shell"
+    ),
+)
+
+LEFT = (
+    Shape("left_hip_pitch_link", "cylinder", (0.045, 0.03), (0, 0.04, -0.025), (1.5708, 0, 0),
+          material="dark"),
+    Shape("left_hip_roll_link", "capsule", (0.05,), ends=(0.02, 0, -0.02, 0.02, 0, -0.09),
+          material="shell"),
+    Shape("left_hip_yaw_link", "capsule", (0.052,), ends=(-0.02, 0, -0.04, -0.066, 0, -0.15),
+          material="shell"),
+    Shape("left_knee_link", "capsule", (0.046,), ends=(0.005, 0, -0.03, 0.008, 0, -0.12),
+          material="shell"),
+    Shape("left_knee_link", "capsule", (0.032,), ends=(0.006, 0, -0.14, 0, 0, -0.27),
+          material="dark"),
+    Shape("left_shoulder_pitch_link", "cylinder", (0.035, 0.025), (0, 0.035, -0.01),
+          (1.5708, 0, 0), material="dark"),
+    Shape("left_shoulder_roll_link", "capsule", (0.036,), ends=(0, 0.006, -0.02, 0, 0.006, -0.07),
+          material="shell"),
+    Shape("left_shoulder_yaw_link", "capsule", (0.034,), ends=(0.003, 0, -0.01, 0.013, 0, -0.08),
+          material="shell"),
+    Shape("left_elbow_link", "capsule", (0.031,), ends=(0.02, 0, -0.01, 0.08, 0.002, -0.01),
+          material="shell"),
+    Shape("left_wrist_pitch_link", "capsule", (0.027,), ends=(-0.01, 0, 0, 0.035, 0, 0),
+          material="dark"),
+    Shape("left_wrist_yaw_link", "box", (0.05, 0.016, 0.035), (0.085, 0.003, 0), material="dark",
+          name="left_hand"),
+    Shape("left_wrist_yaw_link", "box", (0.035, 0.014, 0.032), (0.165, -0.002, -0.004),
+          (0, 0, -0.25), material="dark"),
+)  # fmt: skip
+
+FEET = tuple(
+    Shape(
+        f"{side}_ankle_roll_link",
+        "box",
+        (0.095, 0.032, 0.012),
+        (0.034, 0, -0.02),
+        material="dark",
+        name=f"{side}_sole",
+    )
+    for side in ("left", "right")
+)
+"""Soles as seen; their lower side is above the contact spheres, which alone meet the ground."""
+
+SHAPES = (*BODY, *LEFT, *(mirror(shape) for shape in LEFT), *FEET)
+
+FOOT_POINTS = ((-0.05, 0.025, -0.03), (-0.05, -0.025, -0.03), (0.12, 0.03, -0.03), (0.12, -0.03, -0.03))  # fmt: skip  # noqa: E501
+"""Centres of the contact spheres in the ankle roll link [m]."""
+
+FOOT_RADIUS = 0.005
+"""Radius of the contact spheres [m]."""
+
+EXCLUDED = (
+    ("pelvis", "torso_link"),
+    ("pelvis", "waist_roll_link"),
+    ("waist_yaw_link", "torso_link"),
+    *((body, f"{side}_{link}_link") for side in ("left", "right") for body, link in (
+        ("pelvis", "hip_roll"), ("pelvis", "hip_yaw"),
+        ("torso_link", "shoulder_roll"), ("torso_link", "shoulder_yaw"),
+    )),
+    *((f"{side}_{a}_link", f"{side}_{b}_link") for side in ("left", "right") for a, b in (
+        ("hip_pitch", "hip_yaw"), ("hip_roll", "knee"), ("knee", "ankle_roll"),
+        ("shoulder_pitch", "shoulder_yaw"), ("shoulder_roll", "elbow"),
+        ("elbow", "wrist_pitch"), ("elbow", "wrist_yaw"), ("wrist_roll", "wrist_yaw"),
+    )),
+)  # fmt: skip
+"""Pairs of links whose shapes overlap by construction and never collide."""
+
+SITES = (
+    Frame("head", "torso_link", (0.05, 0, 0.42)),
+    Frame("imu", "torso_link", (-0.03959, -0.00224, 0.13792)),
+    Frame("left_wrist", "left_wrist_yaw_link", (0, 0, 0), (1, 0, 0), (0, 1, 0)),
+    Frame("right_wrist", "right_wrist_yaw_link", (0, 0, 0), (1, 0, 0), (0, -1, 0)),
+    Frame("left_palm", "left_wrist_yaw_link", (0.1, -0.013, 0), (1, 0, 0), (0, 1, 0)),
+    Frame("right_palm", "right_wrist_yaw_link", (0.1, 0.013, 0), (1, 0, 0), (0, -1, 0)),
+    *(
+        Frame(f"{side}_foot_{i}", f"{side}_ankle_roll_link", point)
+        for side in ("left", "right")
+        for i, point in enumerate(FOOT_POINTS)
+    ),
+)
+
+HEAD_CAMERA = Frame(
+    "head", "torso_link", (0.0576235, 0.01753, 0.41987), (0.6743, 0, -0.7384), (0.7384, 0, 0.6743)
+)
+"""The depth camera in the visor, pitched down by 0.8308 rad."""
+
+HEAD_FOVY = 58.0
+"""Vertical field of view of the head camera [deg]."""
+
+WRIST_CAMERAS = (
+    Frame("left_wrist", "left_wrist_yaw_link", (-0.02, 0.05, 0.03), (0.9, -0.35, -0.12), (0, 0, 1)),
+    Frame(
+        "right_wrist", "right_wrist_yaw_link", (-0.02, -0.05, 0.03), (0.9, 0.35, -0.12), (0, 0, 1)
+    ),
+)
+WRIST_FOVY = 75.0
+
+SCENE_CAMERA = Frame("scene", "pelvis", (1.55, 1.1, 0.35), (-1.55, -1.1, -0.4), (0, 0, 1))
+SCENE_FOVY = 45.0

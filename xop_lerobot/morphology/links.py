@@ -1,0 +1,265 @@
+"""Rows of the tables that robots are built from, and what turns the rows into a MuJoCo model.
+
+Rows are plain data, so that a robot's numbers cost nothing to import; MuJoCo is loaded by the
+`add_*` functions alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.transforms import quat_from_matrix, quat_from_rpy
+
+if TYPE_CHECKING:
+    import mujoco
+
+Vector = tuple[float, ...]
+
+FLOOR_BIT, ROBOT_BIT, OBJECT_BIT = 1, 2, 4
+"""Collision bits: what a geom is (`contype`) and what it meets (`conaffinity`)."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint with one degree of freedom.
+
+    Attributes:
+        name: Its name.
+        axis: Axis in the child link's frame.
+        limits: Lower and upper limit [rad or m], None for a joint that turns without end.
+        effort: Largest torque or force [N m or N].
+        velocity: Largest velocity [rad/s or m/s].
+        slides: Whether it slides rather than turns.
+    """
+
+    name: str
+    axis: Vector
+    limits: tuple[float, float] | None
+    effort: float
+    velocity: float
+    slides: bool = False
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid body and the joint that holds it to its parent.
+
+    Attributes:
+        name: Its name.
+        parent: Name of the parent link, None for the floating base.
+        pos: Origin in the parent's frame [m].
+        mass: Mass [kg].
+        com: Centre of mass in the link's frame [m].
+        inertia: About the centre of mass [kg m^2]: three principal moments in the axes of
+            `inertia_quat`, or xx, yy, zz, xy, xz, yz in the link's axes.
+        joint: The joint, None for a link that is fixed to its parent or floats.
+        quat: Orientation in the parent's frame at joint angle 0, wxyz.
+        inertia_quat: Orientation of the principal axes, wxyz.
+    """
+
+    name: str
+    parent: str | None
+    pos: Vector
+    mass: float
+    com: Vector
+    inertia: Vector
+    joint: Joint | None = None
+    quat: Vector = (1, 0, 0, 0)
+    inertia_quat: Vector = (1, 0, 0, 0)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A primitive that collides, is seen, or both.
+
+    Attributes:
+        link: The link it is fixed to.
+        kind: ``"box"``, ``"sphere"``, ``"ellipsoid"``, ``"cylinder"`` or ``"capsule"``.
+        size: Half sizes, or radius and half length, as MuJoCo takes them [m].
+        pos: Centre in the link's frame [m].
+        rpy: Roll, pitch, yaw in the link's frame [rad].
+        ends: Both ends of the axis of a capsule or cylinder, in place of `pos` and `rpy` [m].
+        material: Name of its material, None for a shape that is not seen.
+        collides: Whether it collides with the floor, with objects and with other links.
+        name: Its name, where someone asks for it.
+    """
+
+    link: str
+    kind: str
+    size: Vector
+    pos: Vector = (0, 0, 0)
+    rpy: Vector = (0, 0, 0)
+    ends: Vector | None = None
+    material: str | None = None
+    collides: bool = True
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A named frame on a link: a site or a camera.
+
+    Attributes:
+        name: Its name.
+        link: The link it is fixed to.
+        pos: Origin in the link's frame [m].
+        x_axis: Its X axis in the link's frame.
+        z_axis: Its Z axis in the link's frame; Y = Z × X.
+    """
+
+    name: str
+    link: str
+    pos: Vector
+    x_axis: Vector = (1, 0, 0)
+    z_axis: Vector = (0, 0, 1)
+
+    @property
+    def quat(self) -> np.ndarray:
+        """Orientation in the link's frame, wxyz. Shape (4,)."""
+        x_axis = np.asarray(self.x_axis, float)
+        x_axis = x_axis / np.linalg.norm(x_axis)
+        z_axis = np.asarray(self.z_axis, float)
+        z_axis = z_axis - (z_axis @ x_axis) * x_axis
+        z_axis = z_axis / np.linalg.norm(z_axis)
+        return quat_from_matrix(np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=1))
+
+
+def new_spec(name: str, timestep: float, planning: bool) -> mujoco.MjSpec:
+    """Make an empty model with the settings every robot shares.
+
+    Args:
+        name: Name of the model.
+        timestep: Physics step [s].
+        planning: Whether it is a planning model, which gives up what the prediction needs not.
+    """
+    import mujoco  # noqa: PLC0415
+
+    spec = mujoco.MjSpec()
+    spec.modelname = name
+    spec.compiler.degree = False
+    spec.option.timestep = timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    # Islands pay off with many separate bodies; one robot is faster without.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    if planning:
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    return spec
+
+
+def add_links(spec: mujoco.MjSpec, links: Iterable[Link], free_joint: str) -> None:
+    """Add bodies, inertias and joints; the first link floats on `free_joint`."""
+    import mujoco  # noqa: PLC0415
+
+    for link in links:
+        parent = spec.worldbody if link.parent is None else spec.body(link.parent)
+        body = parent.add_body(name=link.name, pos=link.pos, quat=link.quat)
+        body.explicitinertial = True
+        body.mass, body.ipos = link.mass, link.com
+        if len(link.inertia) == 6:  # noqa: PLR2004
+            body.fullinertia = link.inertia
+        else:
+            body.inertia, body.iquat = link.inertia, link.inertia_quat
+        if link.parent is None:
+            body.add_freejoint(name=free_joint)
+        elif link.joint is not None:
+            joint = link.joint
+            kind = mujoco.mjtJoint.mjJNT_SLIDE if joint.slides else mujoco.mjtJoint.mjJNT_HINGE
+            made = body.add_joint(name=joint.name, type=kind, axis=joint.axis)
+            if joint.limits is not None:
+                made.limited, made.range = True, joint.limits
+
+
+def add_materials(spec: mujoco.MjSpec, colours: Mapping[str, Vector]) -> None:
+    """Add matt materials: name to red, green, blue and gloss, each 0 to 1."""
+    for name, (red, green, blue, gloss) in colours.items():
+        spec.add_material(
+            name=name, rgba=(red, green, blue, 1), specular=gloss, shininess=0.4, reflectance=0
+        )
+
+
+def add_shapes(spec: mujoco.MjSpec, shapes: Iterable[Shape]) -> None:
+    """Add geoms: seen ones in group 2, hidden collision geoms in group 3; none adds mass."""
+    import mujoco  # noqa: PLC0415
+
+    for shape in shapes:
+        geom = spec.body(shape.link).add_geom(
+            type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.kind.upper()}"),
+            size=[*shape.size, 0, 0][:3],
+            mass=0,
+            group=3 if shape.material is None else 2,
+        )
+        if shape.name:
+            geom.name = shape.name
+        if shape.ends is not None:
+            geom.fromto = shape.ends
+        else:
+            geom.pos, geom.quat = shape.pos, quat_from_rpy(*shape.rpy)
+        if shape.material is not None:
+            geom.material = shape.material
+        if shape.collides:
+            geom.contype, geom.conaffinity = ROBOT_BIT, FLOOR_BIT | ROBOT_BIT | OBJECT_BIT
+        else:
+            geom.contype = geom.conaffinity = 0
+
+
+def add_sites(spec: mujoco.MjSpec, frames: Iterable[Frame]) -> None:
+    """Add a site for each frame."""
+    for frame in frames:
+        spec.body(frame.link).add_site(
+            name=frame.name, pos=frame.pos, quat=frame.quat, size=(0.005,) * 3, group=5
+        )
+
+
+def add_camera(spec: mujoco.MjSpec, frame: Frame, fovy: float, *, tracking: bool = False) -> None:
+    """Add a camera that looks along the X axis of `frame`, whose Z axis is up in the picture.
+
+    Args:
+        spec: The model.
+        frame: Where the camera is.
+        fovy: Vertical field of view [deg].
+        tracking: Whether it follows the link's position alone and keeps its direction.
+    """
+    import mujoco  # noqa: PLC0415
+
+    x_axis, z_axis = np.asarray(frame.x_axis, float), np.asarray(frame.z_axis, float)
+    # MuJoCo's cameras look along -Z with Y up.
+    seen = Frame(frame.name, frame.link, frame.pos, tuple(np.cross(x_axis, z_axis)), tuple(-x_axis))
+    mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK if tracking else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+    spec.body(frame.link).add_camera(
+        name=frame.name, pos=frame.pos, quat=seen.quat, fovy=fovy, mode=mode
+    )
+
+
+def add_servo(
+    spec: mujoco.MjSpec,
+    joint: Joint,
+    stiffness: float,
+    damping: float,
+    *,
+    name: str = "",
+    force: float | None = None,
+) -> None:
+    r"""Add a position servo :math:`\tau = k_p (u - q) - k_d \dot q`, :math:`|\tau| \le f`.
+
+    Args:
+        spec: The model.
+        joint: The joint it turns; its limits are those of the control too.
+        stiffness: k_p [N m/rad or N/m].
+        damping: k_d [N m s/rad or N s/m].
+        name: Name of the actuator, the joint's by default.
+        force: Limit f, the joint's effort by default.
+    """
+    import mujoco  # noqa: PLC0415
+
+    force = joint.effort if force is None else force
+    actuator = spec.add_actuator(
+        name=name or joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+    )
+    actuator.set_to_position(kp=stiffness, kv=damping)
+    actuator.forcelimited, actuator.forcerange = True, (-force, force)
+    if joint.limits is not None:
+        actuator.ctrllimited, actuator.ctrlrange = True, joint.limits
