@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from xop_lerobot.command import ActionLayout, CommandSpace, Mode, RobotAction
+from xop_lerobot.morphology.effect import Effect
 from xop_lerobot.registry import Registry
 
 if TYPE_CHECKING:
@@ -63,6 +64,15 @@ class Morphology(ABC):
     """Tilt of the base over which the robot counts as fallen [rad]."""
     wheeled: bool
     """Whether it stands on wheels (contact points roll, the base stays level)."""
+
+    effects: tuple[Effect, ...]
+    """What each entry of the command does, in the order of `command_space`."""
+    contact_groups: tuple[tuple[str, ...], ...]
+    """`contact_points` that touch the ground together: a foot, a wheel."""
+    pivot: float = 0.0
+    """Forward distance from the base's frame to its centre of turning [m]."""
+    hull_points: dict[str, float] = {}
+    """Sites on the hull of the robot and the radius around each [m], for obstacles."""
 
     @abstractmethod
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:

@@ -2,41 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import Enum
-
 import mujoco
 import numpy as np
 
 from xop_lerobot.command import CommandSpace, Mode
+from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.transforms import quat_from_yaw, quat_multiply, quat_yaw
-
-
-class Acts(Enum):
-    """On what an entry of a command acts."""
-
-    HEIGHT = "height of the base over the ground"
-    JOINT = "angle of a joint"
-    FORWARD = "velocity of the base along its heading"
-    LEFT = "velocity of the base across its heading"
-    TURN = "yaw rate of the base"
-
-
-@dataclass(frozen=True)
-class Effect:
-    """Effect of one entry of a command.
-
-    Attributes:
-        acts: On what it acts.
-        joint: The joint, where it acts on one.
-        lag_s: Time constant with which height or joint follow the command [s].
-        modes: Modes in which it has an effect at all.
-    """
-
-    acts: Acts
-    joint: str = ""
-    lag_s: float = 0.15
-    modes: tuple[Mode, ...] = (Mode.STATIONARY, Mode.MOBILE)
 
 
 class CommandModel:

@@ -1,0 +1,244 @@
+"""The model predictive controller: KMPPI over MuJoCo with the low-level policy in the loop."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from time import perf_counter
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
+from xop_lerobot.retarget.costs import (
+    CollisionCost,
+    ControlCost,
+    Cost,
+    Evaluation,
+    FallCost,
+    StanceCost,
+    TerminalCost,
+    TrackingCost,
+)
+from xop_lerobot.retarget.costs.collision import make_obstacles
+from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.kmppi import Kmppi, compute_effective_samples
+from xop_lerobot.retarget.plan import Plan, Retargeter, Status
+from xop_lerobot.retarget.proposal import KinematicProposal
+from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
+from xop_lerobot.state import Goal, RobotState
+from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply, rotation_error
+
+
+class MpcRetargeter(Retargeter):
+    r"""Solves Eq. 1: :math:`\min_{a_0 \dots a_{H-1}} \sum_k l(x_k, a_k, G) + V_f(x_H, G)`.
+
+    Each solve shifts the last plan by the time that has passed, adds three fixed candidates (the
+    kinematic proposal, the command being executed, the neutral command) to antithetic samples
+    around it, rolls all out in MuJoCo with the low-level policy and its memory in the loop, and
+    moves the plan to the weighted mean.
+
+    Args:
+        morphology: The robot.
+        policy: Its low-level policy.
+        model: Its planning model in the scene.
+        config: Settings; zeros take the robot's own parameters.
+        frames: Tracked frames that the commands shall follow.
+    """
+
+    def __init__(
+        self,
+        morphology: Morphology,
+        policy: LowLevelPolicy,
+        model: mujoco.MjModel,
+        config: RetargeterConfig | None = None,
+        frames: tuple[str, ...] = ("head",),
+    ) -> None:
+        config = config or RetargeterConfig()
+        self.morphology, self.frames = morphology, frames
+        self.space = morphology.command_space
+        self.configs = {mode: _override(morphology.mpc_config(mode), config) for mode in Mode}
+        self.rollout = PolicyRollout(model, policy, config.num_threads)
+        self.command_model = CommandModel(
+            model, self.space, morphology.effects, morphology.pivot
+        )
+        self.sites = {name: morphology.frames[name] for name in frames}
+        obstacles = make_obstacles(model)
+        hull = morphology.hull_points if obstacles else {}
+        self.kinematics = SiteKinematics(
+            model, tuple({*self.sites.values(), *morphology.contact_points, *hull})
+        )
+        self.proposal = KinematicProposal(self.command_model, self.kinematics, self.sites)
+        standing_height = float(morphology.standing_qpos()[2])
+        self.costs: tuple[Cost, ...] = (
+            TrackingCost(),
+            TerminalCost(),
+            StanceCost(morphology.contact_groups, morphology.wheeled),
+            CollisionCost(obstacles, hull),
+            ControlCost(self.proposal.scale),
+            FallCost(morphology.fall_tilt, morphology.fall_height, standing_height),
+        )
+        self.cost_names = tuple(cost.name for cost in self.costs)
+        self._rng = np.random.default_rng(config.seed)
+        self._seed = config.seed
+        self._planners = {
+            mode: Kmppi(self.configs[mode].horizon, self.space.low, self.space.high, each)
+            for mode, each in self.configs.items()
+        }
+        self._noise = {
+            mode: np.array([each.noise_std.get(name, 0.0) for name in self.space.names])
+            * self.command_model.acting(mode)
+            for mode, each in self.configs.items()
+        }
+        self._last: tuple[float, Mode] | None = None
+
+    def control_period(self, mode: Mode) -> float:
+        """Time between two plans in `mode` [s]."""
+        return 1 / self.configs[mode].control_hz
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self.rollout.close()
+
+    def reset(self, state: RobotState) -> None:
+        """Start anew from the command that `state` executes, with the seed's first samples."""
+        self._rng = np.random.default_rng(self._seed)
+        self._last = None
+        for planner in self._planners.values():
+            planner.reset(state.command)
+
+    def plan(self, state: RobotState, goal: Goal) -> Plan:
+        """Compute the plan from `state` towards `goal`."""
+        start = perf_counter()
+        mode, config, planner = goal.mode, self.configs[goal.mode], self._planners[goal.mode]
+        self._warm_start(state, mode)
+        ahead = np.arange(config.horizon + 1) * POLICY_DT
+        goals = self._preview(goal, ahead, config)
+        proposal = self.proposal.solve(
+            state.qpos,
+            {name: poses[0] for name, poses in self._preview(goal, _at(config.proposal_s), config).items()},
+            mode,
+            config.proposal_s,
+            start=planner.commands[0],
+        )
+        candidates = np.stack([proposal, state.command, self.space.neutral])
+        acting = self.command_model.acting(mode)
+        candidates = np.where(acting, candidates, self.space.neutral)
+        noise = self._noise[mode] * self._noise_share(state, goals, config)
+        samples = planner.sample(self._rng, noise, candidates)
+        sampled = perf_counter()
+
+        prediction = self.rollout.predict(
+            state.qpos, state.qvel, state.memory, samples.commands, state.arms, mode
+        )
+        rolled = perf_counter()
+        terms = self._evaluate(prediction, goals, goal, proposal, config)
+        costs = np.sum(list(terms.values()), axis=0)
+        weights = planner.update(samples, costs)
+        best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+        end = perf_counter()
+
+        self._last = (state.time, mode)
+        return Plan(
+            command=planner.commands[0],
+            commands=planner.commands,
+            mode=mode,
+            qpos=prediction.qpos[best],
+            cost={name: float(np.nan_to_num(term[best])) for name, term in terms.items()},
+            status=Status.OK if np.isfinite(costs).any() else Status.DIVERGED,
+            effective_samples=compute_effective_samples(weights),
+            timings={
+                "solve": end - start,
+                "proposal": sampled - start,
+                "rollout": rolled - sampled,
+                "policy": prediction.policy_s,
+                "physics": prediction.physics_s,
+                "cost": end - rolled,
+            },
+        )
+
+    def _warm_start(self, state: RobotState, mode: Mode) -> None:
+        """Shift the last plan by the time that has passed, or start from the executed command."""
+        planner = self._planners[mode]
+        if self._last is None or self._last[1] is not mode:
+            planner.reset(state.command)
+        else:
+            planner.shift(max(0.0, state.time - self._last[0]) / POLICY_DT)
+
+    def _preview(
+        self, goal: Goal, ahead: np.ndarray, config: MpcConfig
+    ) -> dict[str, np.ndarray]:
+        """Goals `ahead` seconds from now, at constant velocity up to `preview_s`."""
+        times = np.minimum(ahead, config.preview_s)[:, None]
+        goals = {}
+        for name in self.frames:
+            if name not in goal.poses:
+                continue
+            pose, velocity = goal.poses[name], goal.velocities.get(name, np.zeros(6))
+            position = pose[:3] + times * velocity[:3]
+            quat = quat_multiply(quat_exp(times * velocity[3:]), pose[3:])
+            goals[name] = make_pose(position, quat)
+        return goals
+
+    def _noise_share(
+        self, state: RobotState, goals: Mapping[str, np.ndarray], config: MpcConfig
+    ) -> float:
+        """Share of the full noise: little at the goal, where fine commands are what counts."""
+        poses = self.kinematics.compute_poses(state.qpos, tuple(self.sites.values()))
+        error = 0.0
+        for name, goal in goals.items():
+            pose = poses[self.sites[name]]
+            turn = np.linalg.norm(rotation_error(goal[-1, 3:], pose[3:]))
+            error = max(error, np.linalg.norm(pose[:3] - goal[-1, :3]), 0.5 * turn)
+        return float(np.clip(error / config.full_noise_error, config.min_noise, 1.0))
+
+    def _evaluate(
+        self,
+        prediction: Prediction,
+        goals: Mapping[str, np.ndarray],
+        goal: Goal,
+        reference: np.ndarray,
+        config: MpcConfig,
+    ) -> dict[str, np.ndarray]:
+        """Cost of every sample by term. Shapes (K,)."""
+        sites = {name: self.sites[name] for name in goals}
+        extrapolated = self.command_model.extrapolate(
+            prediction.qpos[:, -1], prediction.commands[:, -1], config.extrapolation_s, goal.mode
+        )
+        terminal = self.kinematics.compute_poses(extrapolated, tuple(sites.values()))
+        last = config.horizon * POLICY_DT + config.extrapolation_s
+        evaluation = Evaluation(
+            qpos=prediction.qpos,
+            qvel=prediction.qvel,
+            commands=prediction.commands,
+            reference=reference,
+            poses=self.kinematics.compute_poses(prediction.qpos),
+            goals=goals,
+            terminal_poses={name: terminal[site] for name, site in sites.items()},
+            terminal_goals={
+                name: poses[0] for name, poses in self._preview(goal, _at(last), config).items()
+            },
+            sites=sites,
+            mode=goal.mode,
+            dt=POLICY_DT,
+            weights=config.weights,
+        )
+        return {cost.name: cost.compute(evaluation) for cost in self.costs}
+
+
+def _at(time: float) -> np.ndarray:
+    return np.array([time])
+
+
+def _override(config: MpcConfig, settings: RetargeterConfig) -> MpcConfig:
+    """Apply what the user set; zeros leave the robot's own parameter."""
+    wanted = {
+        name: getattr(settings, name)
+        for name in ("num_samples", "horizon", "control_hz")
+        if getattr(settings, name)
+    }
+    return dataclasses.replace(config, **wanted)
