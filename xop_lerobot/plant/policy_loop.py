@@ -1,0 +1,117 @@
+"""The robot as LeRobot sees it: a low-level policy that closes the loop around a plant."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from xop_lerobot.command import RobotAction
+from xop_lerobot.errors import BadValue
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.plant.plant import Measurement, Plant
+from xop_lerobot.state import RobotState, freeze
+
+_SETTLED_SPEED = 0.1  # speed of the base under which a robot stands still [m/s]
+
+
+class PolicyLoop:
+    """Runs the policy at 50 Hz in lock-step: time passes only inside `execute`.
+
+    Args:
+        morphology: The robot.
+        plant: Its body.
+        policy: Its low-level policy.
+    """
+
+    def __init__(self, morphology: Morphology, plant: Plant, policy: LowLevelPolicy) -> None:
+        self.morphology, self.plant, self.policy = morphology, plant, policy
+        self._memory = policy.initial_memory(1)
+        self._action = morphology.rest_action()
+        self._measurement: Measurement | None = None
+
+    @property
+    def state(self) -> RobotState:
+        """The robot now, as measured; the same value until time passes."""
+        if self._measurement is None:
+            self._measurement = self.plant.measure()
+        measured, action = self._measurement, self._action
+        return RobotState(
+            time=measured.time,
+            qpos=freeze(measured.qpos),
+            qvel=freeze(measured.qvel),
+            memory=freeze(self._memory[0]),
+            command=freeze(action.command),
+            arms=freeze(action.arms),
+            mode=action.mode,
+            effort=freeze(measured.effort),
+            true_qpos=freeze(measured.true_qpos),
+            true_qvel=freeze(measured.true_qvel),
+            wall_time=time.time(),
+            fallen=measured.fallen,
+            collision=measured.collision,
+            settled=bool(np.linalg.norm(measured.true_qvel[:3]) < _SETTLED_SPEED),
+        )
+
+    def reset(self, seed: int | None = None, settle_s: float = 1.0) -> None:
+        """Put the robot at rest and let the policy settle it for `settle_s` [s]."""
+        self.plant.reset(seed)
+        self._memory = self.policy.initial_memory(1)
+        self._action = self.morphology.rest_action()
+        self._measurement = None
+        self._advance(settle_s)
+
+    def execute(self, action: RobotAction, dt: float) -> RobotAction:
+        """Limit `action`, execute it for `dt` [s], and return what was executed.
+
+        Raises:
+            BadValue: If `dt` is not a whole multiple of the policy's period.
+        """
+        self._action = limit_action(self.morphology, action, self._action, dt)
+        self._advance(dt)
+        return self._action
+
+    def _advance(self, dt: float) -> None:
+        steps = round(dt / POLICY_DT)
+        if abs(steps * POLICY_DT - dt) > 1e-9:  # noqa: PLR2004
+            raise BadValue(f"dt = {dt} s is not a whole multiple of the policy period {POLICY_DT} s")
+        for _ in range(steps):
+            measured = self._measurement or self.plant.measure()
+            targets, self._memory = self.policy.act(
+                measured.qpos[None],
+                measured.qvel[None],
+                self._action.command[None],
+                self._action.arms[None],
+                self._memory,
+                self._action.mode,
+            )
+            self.plant.apply(targets[0])
+            self.plant.step(POLICY_DT)
+            self._measurement = None
+
+    def close(self) -> None:
+        """Close the plant; may be called twice."""
+        self.plant.close()
+
+
+ARM_MAX_SPEED = 6.0
+"""Largest speed of arm targets that a robot executes [rad/s]; grippers are not limited."""
+
+
+def limit_action(
+    morphology: Morphology, action: RobotAction, previous: RobotAction, dt: float
+) -> RobotAction:
+    """What of `action` a robot executes after `previous` within `dt` [s].
+
+    Teleoperator and robot both call it, so that the recorded action is the executed one:
+    limiting twice is limiting once.
+    """
+    command = morphology.command_space.limit(action.command, previous.command, dt, action.mode)
+    num_joints = sum(len(arm.joints) for arm in morphology.arms)
+    arms = np.array(action.arms, dtype=float)
+    reach = ARM_MAX_SPEED * dt
+    arms[:num_joints] = np.clip(
+        arms[:num_joints], previous.arms[:num_joints] - reach, previous.arms[:num_joints] + reach
+    )
+    return RobotAction(command, action.mode, arms)

@@ -1,0 +1,119 @@
+"""Arm inverse kinematics: the wrists follow the operator's, whatever the body does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mink
+import mujoco
+import numpy as np
+
+from xop_lerobot.morphology.morphology import Morphology
+
+_MAX_DT = 0.05  # after a stall the arms move as after one late tick, not all at once
+
+
+class ArmIk:
+    """Differential inverse kinematics of the arms with mink, the rest of the body as measured.
+
+    Each solve starts from the targets sent last, not from the measured arms, so that sensor
+    noise and sagging never reach the targets. Joint limits and a joint speed limit hold by
+    construction; the posture term pulls weakly towards the rest angles and keeps the elbows
+    from drifting through the null space.
+
+    Args:
+        morphology: The robot.
+        model: Its planning model.
+        max_speed: Speed limit of the arm joints [rad/s].
+        iterations: Steps per solve.
+    """
+
+    def __init__(
+        self,
+        morphology: Morphology,
+        model: mujoco.MjModel,
+        max_speed: float = 3.0,
+        iterations: int = 2,
+    ) -> None:
+        self.iterations = iterations
+        joints = [joint for arm in morphology.arms for joint in arm.joints]
+        self.num_joints = len(joints)
+        self._qpos = np.array([int(model.joint(joint).qposadr[0]) for joint in joints])
+        dofs = [int(model.joint(joint).dofadr[0]) for joint in joints]
+        self._configuration = mink.Configuration(model)
+        self._tasks = {
+            arm.frame: mink.FrameTask(
+                morphology.frames[arm.frame],
+                "site",
+                position_cost=1.0,
+                orientation_cost=0.2,
+                gain=0.6,
+                lm_damping=1e-3,
+            )
+            for arm in morphology.arms
+        }
+        rest = np.array([morphology.arm_rest.get(joint, 0.0) for joint in joints])
+        posture_cost = np.zeros(model.nv)
+        posture_cost[dofs] = 0.02
+        self._posture = mink.PostureTask(model, posture_cost)
+        self._rest = rest
+        frozen = sorted(set(range(model.nv)) - set(dofs))
+        self._constraints = [mink.DofFreezingTask(model, frozen)]
+        self._limits = [
+            mink.ConfigurationLimit(model, gain=0.5),
+            mink.VelocityLimit(model, dict.fromkeys(joints, max_speed)),
+        ]
+        self._lower = model.jnt_range[[model.joint(joint).id for joint in joints], 0]
+        self._upper = model.jnt_range[[model.joint(joint).id for joint in joints], 1]
+        self.failures = 0
+        """Number of solves that the quadratic program failed; the arms then stay."""
+
+    def solve(
+        self,
+        qpos: np.ndarray,
+        arms: np.ndarray,
+        goals: Mapping[str, np.ndarray],
+        dt: float,
+    ) -> np.ndarray:
+        """Move the arm targets towards the wrist goals.
+
+        Args:
+            qpos: Configuration of the robot; its arm angles are not used. Shape (nq,).
+            arms: Arm joint targets sent last [rad]. Shape (num_joints,).
+            goals: Wanted pose in the world of each wrist; arms without a goal stay. Shapes (7,).
+            dt: Time since the last solve [s].
+
+        Returns:
+            New targets within the limits. Shape (num_joints,).
+        """
+        tasks: list[mink.Task] = []
+        for name, task in self._tasks.items():
+            if name in goals:
+                pose = goals[name]
+                task.set_target(mink.SE3(np.concatenate([pose[3:], pose[:3]])))
+                tasks.append(task)
+        if not tasks:
+            return arms.copy()
+        q = qpos.copy()
+        q[self._qpos] = np.clip(arms, self._lower, self._upper)
+        rest = q.copy()
+        rest[self._qpos] = self._rest
+        self._posture.set_target(rest)
+        self._configuration.update(q)
+        step = min(dt, _MAX_DT) / self.iterations
+        for _ in range(self.iterations):
+            try:
+                velocity = mink.solve_ik(
+                    self._configuration,
+                    [*tasks, self._posture],
+                    step,
+                    solver="daqp",
+                    damping=1e-4,
+                    limits=self._limits,
+                    constraints=self._constraints,
+                )
+            except mink.NoSolutionFound:
+                self.failures += 1
+                break
+            self._configuration.integrate_inplace(velocity, step)
+        return np.clip(self._configuration.q[self._qpos], self._lower, self._upper)
