@@ -8,6 +8,7 @@ import numpy as np
 
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.g1.links import LINKS
+from xop_lerobot.morphology.g1.mpc import EFFECTS, mpc_config
 from xop_lerobot.morphology.g1.shapes import FOOT_POINTS
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
 
@@ -67,6 +68,8 @@ class G1(Morphology):
     contact_points = tuple(
         f"{side}_foot_{i}" for side in ("left", "right") for i in range(len(FOOT_POINTS))
     )
+    contact_groups = (contact_points[: len(FOOT_POINTS)], contact_points[len(FOOT_POINTS) :])
+    effects = EFFECTS
     fall_height = 0.35
     fall_tilt = 0.8
     wheeled = False
@@ -90,6 +93,4 @@ class G1(Morphology):
 
     def mpc_config(self, mode: Mode) -> MpcConfig:
         """Parameters of the model predictive controller in `mode`."""
-        from xop_lerobot.morphology.g1.mpc import mpc_config  # noqa: PLC0415
-
         return mpc_config(mode)

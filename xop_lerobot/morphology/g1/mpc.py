@@ -1,0 +1,42 @@
+"""Parameters of the model predictive controller for G1."""
+
+from __future__ import annotations
+
+from xop_lerobot.command import Mode
+from xop_lerobot.morphology.effect import Acts, Effect
+from xop_lerobot.retarget.config import CostWeights, MpcConfig
+
+STATIONARY = (Mode.STATIONARY,)
+
+EFFECTS = (
+    # While walking the policy neither squats nor turns its waist.
+    Effect(Acts.HEIGHT, lag_s=0.3, modes=STATIONARY),
+    Effect(Acts.JOINT, "waist_yaw_joint", lag_s=0.2, modes=STATIONARY),
+    Effect(Acts.JOINT, "waist_roll_joint", lag_s=0.1),
+    Effect(Acts.JOINT, "waist_pitch_joint", lag_s=0.1),
+    Effect(Acts.FORWARD),
+    Effect(Acts.LEFT),
+    Effect(Acts.TURN),
+)
+
+CONFIGS = {
+    Mode.STATIONARY: MpcConfig(
+        num_samples=16,
+        horizon=8,
+        noise_std={"height": 0.03, "waist_yaw": 0.1, "waist_roll": 0.05, "waist_pitch": 0.1},
+        weights=CostWeights(orientation=0.2),
+    ),
+    Mode.MOBILE: MpcConfig(
+        num_samples=16,
+        horizon=10,
+        noise_std={
+            "waist_roll": 0.03, "waist_pitch": 0.05, "vx": 0.25, "vy": 0.2, "yaw_rate": 0.3,
+        },
+        weights=CostWeights(orientation=0.2),
+    ),
+}  # fmt: skip
+
+
+def mpc_config(mode: Mode) -> MpcConfig:
+    """Parameters in `mode`."""
+    return CONFIGS[mode]
