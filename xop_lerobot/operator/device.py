@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+from xop_lerobot.command import Mode
 from xop_lerobot.operator.frame import OperatorFrame
 
 
@@ -13,9 +14,11 @@ class Device(ABC):
     Attributes:
         self_engaging: Whether the device engages by itself once the robot has settled
             (recordings and scripts do; people use a gesture).
+        start_mode: The mode in which the operator starts, as long as no frame states one.
     """
 
     self_engaging: bool = False
+    start_mode: Mode = Mode.STATIONARY
 
     def connect(self) -> None:
         """Open the device; a file is read and checked here, before any robot moves."""

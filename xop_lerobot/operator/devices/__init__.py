@@ -1,0 +1,28 @@
+"""Devices by name: `make_device(DeviceConfig(type="replay", path="recording.npz"))`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from xop_lerobot.operator.device import Device
+from xop_lerobot.operator.devices.config import DeviceConfig
+from xop_lerobot.registry import Registry
+
+DEVICES: Registry[Callable[[DeviceConfig], Device]] = Registry("device")
+"""Devices by name, each made as ``factory(config)``."""
+
+
+def make_device(config: DeviceConfig) -> Device:
+    """Make the device that `config` names; `connect()` then opens it.
+
+    Raises:
+        UnknownName: Listing the available devices.
+        BadValue: If a setting is out of its range, or one that the device needs is absent.
+    """
+    # Implementations register themselves when they are imported.
+    from xop_lerobot.operator.devices import replay, scripted  # noqa: F401, PLC0415
+
+    return DEVICES[config.type](config)
+
+
+__all__ = ["DEVICES", "DeviceConfig", "make_device"]

@@ -1,0 +1,263 @@
+"""From the operator's world to the robot's: engage, scale, and follow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from xop_lerobot.errors import BadShape, BadValue, UnknownName, XopError
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.state import FRAMES
+from xop_lerobot.transforms import (
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_conjugate,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+)
+
+MIN_OPERATOR_HEIGHT = 0.5
+"""Head height of a person under which the device's origin is surely not the floor [m]."""
+SCALES = ("height_scale", "reach_scale", "walk_scale")
+
+
+class EngageRefused(XopError):
+    """The operator cannot engage now; the message says why."""
+
+
+class NotEngaged(XopError):
+    """Goals are asked for while nobody is engaged."""
+
+    def __init__(self) -> None:
+        super().__init__("the operator is not engaged. Call engage() first.")
+
+
+@dataclass
+class AlignmentConfig:
+    """How the operator's motion is scaled to the robot.
+
+    Attributes:
+        height_scale: Robot's over operator's change of head height; None measures the ratio of
+            the two head heights at engage.
+        reach_scale: Robot's over operator's distance from head to wrist; None is the same as
+            the height scale.
+        walk_scale: Robot's over operator's horizontal travel.
+        frames: Which frames get a goal; the head is followed for alignment in any case.
+    """
+
+    height_scale: float | None = None
+    reach_scale: float | None = None
+    walk_scale: float = 1.0
+    frames: tuple[str, ...] = FRAMES
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            BadValue: If a scale is not a finite number above 0, or there is no frame.
+            UnknownName: If a frame is unknown, with the known ones.
+        """
+        for name in SCALES:
+            scale = getattr(self, name)
+            if scale is not None and not (math.isfinite(scale) and scale > 0):
+                raise BadValue(f"alignment.{name} must be finite and above 0, got {scale}")
+        self.frames = tuple(self.frames)
+        if not self.frames:
+            raise BadValue(f"alignment.frames must name at least one of {', '.join(FRAMES)}")
+        for name in self.frames:
+            if name not in FRAMES:
+                raise UnknownName("alignment frame", name, FRAMES)
+
+
+def is_lost(frame: OperatorFrame) -> bool:
+    """Whether the head is not tracked, which ends an engagement."""
+    return not bool(frame.tracked[0])
+
+
+@dataclass(frozen=True)
+class _Anchor:
+    """What was measured at engage.
+
+    Attributes:
+        operator: Head of the operator. Shape (7,).
+        robot: Head of the robot. Shape (7,).
+        turn: A = Rz(heading of the robot's head − heading of the operator's). Shape (4,).
+        height_scale: Scale of heights.
+        reach_scale: Scale of reaches.
+    """
+
+    operator: np.ndarray
+    robot: np.ndarray
+    turn: np.ndarray
+    height_scale: float
+    reach_scale: float
+
+
+class Alignment:
+    r"""Lays the operator's head and heading on the robot's at engage, and follows from there.
+
+    With A the turn about the vertical that aligns the headings, ₀ the values at engage, ``o``
+    the operator and ``r`` the robot:
+
+    - head: :math:`p_{xy} = r_{0,xy} + s_{walk} A (o - o_0)_{xy}`,
+      :math:`p_z = r_{0,z} + s_{height} (o - o_0)_z`,
+      :math:`R = A R_o R_{o,0}^T A^T R_{r,0}`, so that engaging makes no step;
+    - wrists: :math:`p = p_{head} + s_{reach} A (o_{wrist} - o_{head})`, :math:`R = A R_o`: hands
+      keep their place from the head, and their frames are the same in person and robot.
+
+    Turning, or moving, the operator's world changes no goal. A wrist that is not tracked stays
+    where it was, seen from the head along its heading.
+
+    Args:
+        config: Scales, and the frames that get a goal.
+    """
+
+    def __init__(self, config: AlignmentConfig | None = None) -> None:
+        self.config = config or AlignmentConfig()
+        self._anchor: _Anchor | None = None
+        self._goals: dict[str, np.ndarray] = {}
+        self._from_head: dict[str, np.ndarray] = {}
+
+    @property
+    def is_engaged(self) -> bool:
+        """Whether the operator's motion makes goals."""
+        return self._anchor is not None
+
+    @property
+    def scales(self) -> dict[str, float]:
+        """The scales in use by name.
+
+        Raises:
+            NotEngaged: Before `engage`.
+        """
+        anchor = self._check_engaged()
+        values = (anchor.height_scale, anchor.reach_scale, self.config.walk_scale)
+        return dict(zip(SCALES, values, strict=True))
+
+    def engage(
+        self,
+        frame: OperatorFrame,
+        robot_frames: Mapping[str, np.ndarray],
+        robot_head_height: float,
+    ) -> None:
+        """Lay the operator's head and heading on the robot's, measured now.
+
+        Args:
+            frame: The operator now.
+            robot_frames: Pose of the head and of every frame of the config, robot world (7,).
+            robot_head_height: Height of the robot's head over the ground [m].
+
+        Raises:
+            EngageRefused: If the head is not tracked, or is too low to be over the floor.
+            UnknownName: If `robot_frames` lacks a frame.
+        """
+        if is_lost(frame):
+            raise EngageRefused("cannot engage: the operator's head is not tracked")
+        robot = {name: _get_pose(robot_frames, name) for name in {"head", *self.config.frames}}
+        height_scale = self._measure_height_scale(frame, robot_head_height)
+        heading = compute_heading(robot["head"][3:]) - compute_heading(frame.head[3:])
+        self._anchor = _Anchor(
+            operator=np.array(frame.head, dtype=float),
+            robot=robot["head"],
+            turn=quat_from_yaw(heading),
+            height_scale=height_scale,
+            reach_scale=self.config.reach_scale or height_scale,
+        )
+        # A wrist that is not seen yet is wanted where the robot has it.
+        body = pose_inverse(_level(robot["head"]))
+        self._from_head = {
+            name: pose_multiply(body, robot[name]) for name in self.config.frames if name != "head"
+        }
+        self._goals = {}
+        self.goal_poses(frame)
+
+    def disengage(self) -> None:
+        """Forget the alignment; the next `engage` makes a new one."""
+        self._anchor = None
+        self._goals, self._from_head = {}, {}
+
+    def goal_poses(self, frame: OperatorFrame) -> dict[str, np.ndarray]:
+        """Compute where the operator wants the frames, in the robot's world.
+
+        While the head is not tracked the last goals are returned; see `is_lost`.
+
+        Args:
+            frame: The operator now.
+
+        Returns:
+            Pose of each frame of the config, x y z qw qx qy qz. Shapes (7,).
+
+        Raises:
+            NotEngaged: Before `engage`.
+        """
+        anchor = self._check_engaged()
+        if not is_lost(frame):
+            self._goals = self._compute_goals(anchor, frame)
+        return {name: self._goals[name].copy() for name in self.config.frames}
+
+    def _compute_goals(self, anchor: _Anchor, frame: OperatorFrame) -> dict[str, np.ndarray]:
+        head = _compute_head(anchor, frame.head, self.config.walk_scale)
+        goals = {"head": head}
+        level = _level(head)
+        for name in self.config.frames:
+            if name == "head":
+                continue
+            if frame.tracked[FRAMES.index(name)]:
+                pose = frame.pose(name)
+                reach = anchor.reach_scale * (pose[:3] - frame.head[:3])
+                goals[name] = make_pose(
+                    head[:3] + quat_rotate(anchor.turn, reach),
+                    quat_multiply(anchor.turn, pose[3:]),
+                )
+                self._from_head[name] = pose_multiply(pose_inverse(level), goals[name])
+            else:
+                goals[name] = pose_multiply(level, self._from_head[name])
+        return goals
+
+    def _measure_height_scale(self, frame: OperatorFrame, robot_head_height: float) -> float:
+        if self.config.height_scale is not None:
+            return self.config.height_scale
+        height = float(frame.head[2])
+        if height < MIN_OPERATOR_HEIGHT:
+            raise EngageRefused(
+                f"cannot engage: the operator's head is {height:.2f} m over the device's floor, "
+                f"less than {MIN_OPERATOR_HEIGHT} m. Set the device's floor, or "
+                "--teleop.alignment.height_scale."
+            )
+        if not robot_head_height > 0:
+            raise BadValue(f"robot_head_height must be above 0 m, got {robot_head_height}")
+        return robot_head_height / height
+
+    def _check_engaged(self) -> _Anchor:
+        if self._anchor is None:
+            raise NotEngaged
+        return self._anchor
+
+
+def _compute_head(anchor: _Anchor, head: np.ndarray, walk_scale: float) -> np.ndarray:
+    scale = np.array([walk_scale, walk_scale, anchor.height_scale])
+    travel = scale * quat_rotate(anchor.turn, head[:3] - anchor.operator[:3])
+    # A (R_o R_o0^T) A^T, the operator's rotation since engage in the robot's world axes.
+    since = quat_multiply(head[3:], quat_conjugate(anchor.operator[3:]))
+    rotation = quat_multiply(quat_multiply(anchor.turn, since), quat_conjugate(anchor.turn))
+    return make_pose(anchor.robot[:3] + travel, quat_multiply(rotation, anchor.robot[3:]))
+
+
+def _level(head: np.ndarray) -> np.ndarray:
+    """The head's place and heading without its nod and tilt. Shape (7,)."""
+    return make_pose(head[:3], quat_from_yaw(compute_heading(head[3:])))
+
+
+def _get_pose(robot_frames: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    if name not in robot_frames:
+        raise UnknownName("robot frame", name, robot_frames)
+    pose = np.array(robot_frames[name], dtype=float)
+    if pose.shape != (7,):
+        raise BadShape(f"robot_frames[{name!r}]", (7,), pose.shape)
+    return pose

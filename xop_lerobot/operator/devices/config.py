@@ -1,0 +1,63 @@
+"""Which device drives the robot, and how a recording or script is played."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadValue, UnknownName
+
+
+@dataclass
+class DeviceConfig:
+    """Settings of an operator device.
+
+    Attributes:
+        type: ``"replay"`` plays a recorded person, ``"scripted"`` a list of waypoints.
+        path: `replay`: an ``.npz`` recording, or the directory of a recorded dataset.
+            `scripted`: a YAML file, or the name of a script that is built in.
+        mode: Mode in which the operator starts, ``"stationary"`` or ``"mobile"``, where the
+            recording or script states none; None is stationary.
+        episode: `replay` of a dataset: which episode.
+        speed: Playback speed; 0.5 plays at half the speed.
+        hold_s: How long the last frame is held after the end, before the device has
+            finished [s].
+        seed: `scripted`: seed of the person's sway and tremor.
+        noise: `scripted`: scale of sway and tremor, 0 none, 1 as published for healthy people.
+    """
+
+    type: str = "scripted"
+    path: str | None = None
+    mode: str | None = None
+    episode: int = 0
+    speed: float = 1.0
+    hold_s: float = 5.0
+    seed: int = 0
+    noise: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            UnknownName: If `mode` is not a mode, with the known ones.
+            BadValue: If a number is out of its range, with the range.
+        """
+        if self.mode is not None and self.mode.upper() not in Mode.__members__:
+            raise UnknownName("device.mode", self.mode, (name.lower() for name in Mode.__members__))
+        _check_at_least("device.episode", self.episode, 0)
+        _check_at_least("device.hold_s", self.hold_s, 0)
+        _check_at_least("device.noise", self.noise, 0)
+        _check_at_least("device.seed", self.seed, 0)
+        if not (math.isfinite(self.speed) and self.speed > 0):
+            raise BadValue(f"device.speed must be finite and above 0, got {self.speed}")
+
+    @property
+    def start_mode(self) -> Mode:
+        """The mode in which the operator starts."""
+        return Mode.STATIONARY if self.mode is None else Mode[self.mode.upper()]
+
+
+def _check_at_least(name: str, value: float, low: float) -> None:
+    if not (math.isfinite(value) and value >= low):
+        raise BadValue(f"{name} must be finite and at least {low}, got {value}")

@@ -1,0 +1,85 @@
+"""Play a scripted person: waypoints, made human by minimum jerk, sway and tremor."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.errors import NotConnected
+from xop_lerobot.operator.devices import DEVICES
+from xop_lerobot.operator.devices.config import DeviceConfig
+from xop_lerobot.operator.devices.player import Player
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.noise import HumanNoise
+from xop_lerobot.operator.script import Script, load_script
+from xop_lerobot.transforms import make_pose, quat_exp, quat_from_yaw, quat_multiply, quat_rotate
+
+DEFAULT_SCRIPT = "g1_squat_walk_reach"
+
+
+class ScriptedDevice(Player):
+    """A person who does what a script says; the same seed gives the same stream.
+
+    Args:
+        config: Its settings; without a `path` the script is `DEFAULT_SCRIPT`.
+    """
+
+    def __init__(self, config: DeviceConfig) -> None:
+        super().__init__(config)
+        self._noise = HumanNoise(config.seed, config.noise)
+        self._script: Script | None = None
+
+    def connect(self) -> None:
+        """Read and check the script.
+
+        Raises:
+            BadScript: If it is missing or malformed.
+        """
+        self._script = load_script(self.config.path or DEFAULT_SCRIPT)
+
+    @property
+    def script(self) -> Script:
+        """What is played.
+
+        Raises:
+            NotConnected: Before `connect()`.
+        """
+        if self._script is None:
+            raise NotConnected("device 'scripted'")
+        return self._script
+
+    @property
+    def duration(self) -> float:
+        """Length of the script [s]."""
+        return self.script.duration
+
+    def frame_at(self, stamp: float) -> OperatorFrame:
+        """Frame at `stamp` [s] of the script's clock; a person goes on swaying at the end."""
+        script = self.script
+        sway = self._noise.at(stamp)
+        head = script.tracks["head"].at(stamp)
+        turn = quat_from_yaw(compute_heading(head[3:]))
+
+        def disturb(pose: np.ndarray, offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+            quat = quat_multiply(pose[3:], quat_exp(rotation))
+            return make_pose(pose[:3] + quat_rotate(turn, offset), quat)
+
+        wrists = []
+        for side, name in enumerate(("left_wrist", "right_wrist")):
+            pose = script.tracks[name].at(stamp)
+            if script.wrists_in_body:
+                position = head[:3] + quat_rotate(turn, pose[:3])
+                pose = make_pose(position, quat_multiply(turn, pose[3:]))
+            wrists.append(disturb(pose, sway.wrists[side], sway.wrist_turns[side]))
+        mode = script.mode_at(stamp)
+        return OperatorFrame(
+            stamp,
+            disturb(head, sway.head, sway.head_turn),
+            *wrists,
+            pinch=script.pinch_at(stamp),
+            # A script that states modes states them from the beginning.
+            mode=self.start_mode if mode is None and script.modes else mode,
+        )
+
+
+DEVICES.add("scripted", ScriptedDevice)

@@ -1,0 +1,175 @@
+"""Pinches: the double pinch that toggles the mode, and how far a hand is closed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.operator.frame import OperatorFrame
+
+HANDS = ("left", "right")
+GRIP_OPEN = 0.06
+"""Distance of thumb and index tip from which a hand counts as open [m]."""
+GRIP_CLOSED = 0.015
+"""Distance of thumb and index tip up to which a hand counts as closed [m]."""
+
+
+def grip_from_pinch(distance: np.ndarray | float) -> np.ndarray:
+    """Closing of a hand, 0 open (≥ 0.06 m) to 1 closed (≤ 0.015 m), linear between.
+
+    Args:
+        distance: Distance of thumb and index tip [m]. Any shape.
+    """
+    fraction = (GRIP_OPEN - np.asarray(distance, float)) / (GRIP_OPEN - GRIP_CLOSED)
+    return np.clip(fraction, 0.0, 1.0)
+
+
+@dataclass
+class DoublePinchConfig:
+    """When two pinches count as a double pinch.
+
+    Attributes:
+        hand: The hand that toggles, ``"left"`` or ``"right"``.
+        on: A hand closes at this distance of thumb and index tip [m].
+        off: It opens again at this distance [m].
+        min_frames: Fewest samples in which each pinch is closed.
+        min_pinch: Shortest pinch [s].
+        max_pinch: Longest pinch [s].
+        min_gap: Shortest time from release to the next press [s].
+        max_gap: Longest time from release to the next press; a third pinch within it makes the
+            two no double pinch, so the toggle comes that long after the second release [s].
+        refractory: Time after a toggle before the next double pinch may begin [s].
+        max_wrist_speed: Wrist speed over which a pinch is a grasp, not a gesture [m/s].
+        veto: How long a pinch is distrusted after the hand was lost or fast [s].
+    """
+
+    hand: str = "left"
+    on: float = 0.018
+    off: float = 0.035
+    min_frames: int = 2
+    min_pinch: float = 0.05
+    max_pinch: float = 0.35
+    min_gap: float = 0.06
+    max_gap: float = 0.4
+    refractory: float = 0.8
+    max_wrist_speed: float = 0.5
+    veto: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            UnknownName: If `hand` is no hand.
+            BadValue: If a number is negative, or a pair is in the wrong order.
+        """
+        if self.hand not in HANDS:
+            raise UnknownName("double_pinch.hand", self.hand, HANDS)
+        for name, value in vars(self).items():
+            if name != "hand" and not (math.isfinite(value) and value >= 0):
+                raise BadValue(f"double_pinch.{name} must be finite and at least 0, got {value}")
+        for low, high in (("on", "off"), ("min_pinch", "max_pinch"), ("min_gap", "max_gap")):
+            if getattr(self, low) >= getattr(self, high):
+                raise BadValue(
+                    f"double_pinch.{low} must be below {high}, got {getattr(self, low)} and "
+                    f"{getattr(self, high)}"
+                )
+
+
+class DoublePinchDetector:
+    """Tells double pinches from grasps, by the stamps of the samples alone.
+
+    Pinches with at most `max_gap` between them are one burst. A burst of exactly two clean
+    pinches is a double pinch; a pinch that is too short or too long, a hand that is lost or
+    moves fast, spoils its burst. Since only stamps count, a recorded stream replays to the
+    same toggles.
+
+    Args:
+        config: Thresholds and durations.
+    """
+
+    def __init__(self, config: DoublePinchConfig | None = None) -> None:
+        self.config = config or DoublePinchConfig()
+        self._hand = HANDS.index(self.config.hand)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything seen so far."""
+        self._time: float | None = None
+        self._wrist: np.ndarray | None = None
+        self._closed = False
+        self._closed_frames = 0
+        self._pressed_at = self._released_at = self._began_at = -math.inf
+        self._taps = 0
+        self._spoiled = False
+        self._distrusted_at = self._toggled_at = -math.inf
+
+    def update(self, frame: OperatorFrame) -> bool:
+        """Take one sample; return whether a double pinch is complete with it.
+
+        Samples with the stamp of the last one are ignored; a stamp that goes back starts anew.
+        """
+        if self._time is not None and frame.time < self._time:
+            self.reset()
+        if self._time == frame.time:
+            return False
+        if self._is_distrusted(frame):
+            self._distrusted_at = frame.time
+            # Once the second pinch is released, the hand may move on.
+            self._spoiled |= self._closed or self._taps == 1
+        self._time = frame.time
+        if self._is_tracked(frame):
+            self._follow(frame.time, float(frame.pinch[self._hand]))
+        return self._take_double(frame.time)
+
+    def _is_tracked(self, frame: OperatorFrame) -> bool:
+        return bool(frame.tracked[1 + self._hand])
+
+    def _is_distrusted(self, frame: OperatorFrame) -> bool:
+        """Whether the hand is lost, was lost for long, or moves fast."""
+        if not self._is_tracked(frame):
+            self._wrist = None
+            return True
+        wrist = frame.pose(f"{self.config.hand}_wrist")[:3]
+        last, self._wrist = self._wrist, np.array(wrist, dtype=float)
+        if self._time is None or last is None:
+            return False
+        dt = frame.time - self._time
+        speed = float(np.linalg.norm(wrist - last)) / dt
+        return dt > self.config.veto or speed > self.config.max_wrist_speed
+
+    def _follow(self, time: float, distance: float) -> None:
+        if not self._closed and distance <= self.config.on:
+            self._press(time)
+        elif self._closed and distance >= self.config.off:
+            self._release(time)
+        elif self._closed and distance <= self.config.on:
+            self._closed_frames += 1
+
+    def _press(self, time: float) -> None:
+        if time - self._released_at > self.config.max_gap:
+            self._taps, self._spoiled, self._began_at = 0, False, time
+        elif time - self._released_at < self.config.min_gap:
+            self._spoiled = True
+        self._spoiled |= time - self._distrusted_at < self.config.veto
+        self._closed, self._closed_frames, self._pressed_at = True, 1, time
+
+    def _release(self, time: float) -> None:
+        length = time - self._pressed_at
+        clean = self.config.min_pinch <= length <= self.config.max_pinch
+        self._spoiled |= not clean or self._closed_frames < self.config.min_frames
+        self._closed, self._released_at = False, time
+        self._taps += 1
+
+    def _take_double(self, time: float) -> bool:
+        """Judge the burst once it is over."""
+        if self._closed or not self._taps or time - self._released_at <= self.config.max_gap:
+            return False
+        rested = self._began_at - self._toggled_at >= self.config.refractory
+        double = self._taps == 2 and not self._spoiled and rested  # noqa: PLR2004
+        self._taps, self._spoiled = 0, False
+        if double:
+            self._toggled_at = time
+        return double

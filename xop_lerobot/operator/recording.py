@@ -1,0 +1,223 @@
+"""A recorded person: poses of head and wrists over time, checked before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadRecording
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import interpolate_poses
+from xop_lerobot.state import FRAMES
+
+POSE_KEYS = tuple(f"{frame}_pose" for frame in FRAMES)
+PINCH_KEYS = ("left_pinch", "right_pinch")
+REQUIRED_KEYS = ("t", *POSE_KEYS, *PINCH_KEYS)
+OPTIONAL_KEYS = ("tracked", "mode")
+NORM_TOLERANCE = 1e-3
+"""How far a quaternion's norm may be from 1 before it counts as a fault."""
+MIN_SAMPLES = 2
+
+
+@dataclass(frozen=True)
+class Recording:
+    """T samples of a person, in the operator's world.
+
+    Attributes:
+        t: Times, strictly increasing from 0 [s]. Shape (T,).
+        poses: Head, left and right wrist, x y z qw qx qy qz. Shape (T, 3, 7).
+        pinch: Distance of thumb and index tip, left and right [m]. Shape (T, 2).
+        tracked: Whether each limb was seen. Shape (T, 3), bool.
+        mode: 0 stationary, 1 mobile; None where the recording states none. Shape (T,).
+    """
+
+    t: np.ndarray
+    poses: np.ndarray
+    pinch: np.ndarray
+    tracked: np.ndarray
+    mode: np.ndarray | None = None
+
+    @property
+    def duration(self) -> float:
+        """Length [s]."""
+        return float(self.t[-1])
+
+    def frame_at(self, stamp: float) -> OperatorFrame:
+        r"""Interpolate at any time; before the first and after the last sample these are held.
+
+        Positions are linear, orientations :math:`q_0 \exp(u \log(q_0^{-1} q_1))` along the
+        shorter arc; flags and mode are those of the nearest sample and of the last one.
+
+        Args:
+            stamp: Time on the recording's clock [s].
+        """
+        t = float(np.clip(stamp, self.t[0], self.t[-1]))
+        i = int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2))
+        u = (t - self.t[i]) / (self.t[i + 1] - self.t[i])
+        poses = interpolate_poses(self.poses[i], self.poses[i + 1], u)
+        nearest = i + (u >= 0.5)  # noqa: PLR2004
+        mode = None if self.mode is None else Mode(int(self.mode[i + (u >= 1)]))
+        return OperatorFrame(
+            stamp,
+            *poses,
+            pinch=(1 - u) * self.pinch[i] + u * self.pinch[i + 1],
+            tracked=self.tracked[nearest].copy(),
+            mode=mode,
+        )
+
+
+def load_recording(path: str | Path) -> Recording:
+    """Read an ``.npz`` operator recording.
+
+    Raises:
+        BadRecording: If it is missing or malformed; names the file and the fault.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise BadRecording(path, "it is a directory, but no dataset (there is no meta/info.json)")
+    if not path.is_file():
+        raise BadRecording(path, "there is no such file")
+    try:
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise BadRecording(path, "it is a single array, not an .npz archive")
+        with archive:
+            # Foreign keys are neither needed nor read: they may hold what we refuse to unpickle.
+            names = [key for key in (*REQUIRED_KEYS, *OPTIONAL_KEYS) if key in archive.files]
+            missing = [key for key in REQUIRED_KEYS if key not in names]
+            if missing:
+                raise BadRecording(
+                    path,
+                    f"missing {', '.join(missing)}. Expected: {', '.join(REQUIRED_KEYS)}; "
+                    f"optional: {', '.join(OPTIONAL_KEYS)}. Found: {', '.join(archive.files)}",
+                )
+            arrays = {key: archive[key] for key in names}
+    except (BadZipFile, ValueError, OSError, EOFError) as error:
+        if isinstance(error, BadRecording):
+            raise
+        raise BadRecording(path, f"it is not a readable .npz archive ({error})") from error
+    return make_recording(arrays, path)
+
+
+def make_recording(arrays: Mapping[str, np.ndarray], source: object) -> Recording:
+    """Check the arrays of a recording and make it.
+
+    Args:
+        arrays: The required and optional keys of an operator recording.
+        source: What they came from, for the messages.
+
+    Raises:
+        BadRecording: Naming the first fault and where it is.
+    """
+    t = _check_array(arrays, "t", (None,), source)
+    n = len(t)
+    if n < MIN_SAMPLES:
+        raise BadRecording(source, f"it has {n} samples; at least {MIN_SAMPLES} are needed")
+    steps = np.diff(t)
+    if (steps <= 0).any():
+        i = int(np.argmax(steps <= 0))
+        raise BadRecording(
+            source,
+            f"t must increase strictly, but t[{i}] = {t[i]:g} s is followed by "
+            f"t[{i + 1}] = {t[i + 1]:g} s",
+        )
+    tracked = _check_tracked(arrays, n, source)
+    poses = np.stack([_check_poses(arrays, key, n, source) for key in POSE_KEYS], axis=1)
+    pinch = np.stack([_check_pinch(arrays, key, n, source) for key in PINCH_KEYS], axis=1)
+    mode = _check_mode(arrays, n, source)
+    return Recording(t - t[0], hold_untracked(poses, tracked), pinch, tracked, mode)
+
+
+def hold_untracked(poses: np.ndarray, tracked: np.ndarray) -> np.ndarray:
+    """Replace each untracked pose by the last tracked one (the first one at the beginning).
+
+    Args:
+        poses: Shape (T, 3, 7).
+        tracked: Shape (T, 3), bool.
+
+    Returns:
+        Poses in which a limb that is not seen stands still. Shape (T, 3, 7).
+    """
+    held = poses.copy()
+    index = np.arange(len(poses))
+    for limb in range(poses.shape[1]):
+        seen = tracked[:, limb]
+        if seen.any():
+            last = np.maximum.accumulate(np.where(seen, index, -1))
+            held[:, limb] = poses[np.where(last < 0, np.argmax(seen), last), limb]
+    return held
+
+
+def _check_array(
+    arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, ...], source: object
+) -> np.ndarray:
+    array = np.asarray(arrays[key])
+    wanted = "(" + ", ".join("T" if size is None else str(size) for size in shape) + ")"
+    if len(shape) == 1:
+        wanted = wanted.replace(")", ",)")
+    fits = array.ndim == len(shape) and all(
+        size in (None, actual) for size, actual in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        raise BadRecording(source, f"{key} must have shape {wanted}, got {array.shape}")
+    if array.dtype.kind not in "fiu":
+        raise BadRecording(source, f"{key} must hold numbers, got dtype {array.dtype}")
+    array = array.astype(float)
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        at = ", ".join(map(str, index))
+        raise BadRecording(source, f"{key} must be finite, but {key}[{at}] = {array[index]}")
+    return array
+
+
+def _check_poses(arrays: Mapping[str, np.ndarray], key: str, n: int, source: object) -> np.ndarray:
+    poses = _check_array(arrays, key, (n, 7), source)
+    norm = np.linalg.norm(poses[:, 3:], axis=1)
+    faulty = np.abs(norm - 1) > NORM_TOLERANCE
+    if faulty.any():
+        i = int(np.argmax(faulty))
+        raise BadRecording(
+            source,
+            f"{key}[{i}, 3:] must be a unit quaternion (qw qx qy qz), its norm is {norm[i]:g}",
+        )
+    poses[:, 3:] /= norm[:, None]
+    return poses
+
+
+def _check_pinch(arrays: Mapping[str, np.ndarray], key: str, n: int, source: object) -> np.ndarray:
+    pinch = _check_array(arrays, key, (n,), source)
+    if (pinch < 0).any():
+        i = int(np.argmax(pinch < 0))
+        raise BadRecording(source, f"{key} must not be negative, but {key}[{i}] = {pinch[i]:g} m")
+    return pinch
+
+
+def _check_tracked(arrays: Mapping[str, np.ndarray], n: int, source: object) -> np.ndarray:
+    if "tracked" not in arrays:
+        return np.ones((n, 3), dtype=bool)
+    tracked = np.asarray(arrays["tracked"])
+    if tracked.shape != (n, 3):
+        raise BadRecording(source, f"tracked must have shape ({n}, 3), got {tracked.shape}")
+    if tracked.dtype != bool:
+        raise BadRecording(source, f"tracked must have dtype bool, got {tracked.dtype}")
+    if not tracked[:, 0].any():
+        raise BadRecording(source, "tracked says that the head is never seen")
+    return tracked.copy()
+
+
+def _check_mode(arrays: Mapping[str, np.ndarray], n: int, source: object) -> np.ndarray | None:
+    if "mode" not in arrays:
+        return None
+    mode = _check_array(arrays, "mode", (n,), source)
+    faulty = ~np.isin(mode, [int(m) for m in Mode])
+    if faulty.any():
+        i = int(np.argmax(faulty))
+        raise BadRecording(
+            source, f"mode must be 0 (stationary) or 1 (mobile), but mode[{i}] = {mode[i]:g}"
+        )
+    return mode.astype(int)
