@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 
 from xop_lerobot.errors import BadValue, UnknownName
-from xop_lerobot.transforms import make_pose, quat_multiply, quat_rotate
+from xop_lerobot.transforms import make_pose, quat_from_matrix
 
-
-@dataclass(frozen=True)
-class _Link:
-    """One body on the way from the world to a site, and the joint that moves it."""
-
-    pos: np.ndarray
-    quat: np.ndarray
-    joint: int  # mujoco.mjtJoint of its joint, -1 for none
-    address: int  # of the joint in qpos
-    axis: np.ndarray
-    anchor: np.ndarray
+_HINGE, _SLIDE, _FREE = (
+    int(kind)
+    for kind in (
+        mujoco.mjtJoint.mjJNT_HINGE,
+        mujoco.mjtJoint.mjJNT_SLIDE,
+        mujoco.mjtJoint.mjJNT_FREE,
+    )
+)
 
 
 class SiteKinematics:
     r"""Pose of sites as a function of :math:`q`, broadcast over any leading dimensions.
 
-    A rollout of 30 × 5 states needs 150 head poses; one NumPy pass over the chain of a site
-    gives them all, where a loop over `mj_kinematics` would cost more than a physics step each.
+    A rollout of 30 × 5 states needs 150 head poses; one NumPy pass over the bodies on the way
+    to the sites gives them all, where a loop over `mj_kinematics` would cost as much as the
+    physics. The local transforms of all joints are computed together,
+    :math:`R = R_0 (I + \sin q\,K + (1 - \cos q) K^2)`, and then chained body by body.
 
     Args:
         model: Model whose bodies carry at most one free, hinge or slide joint each.
@@ -35,81 +32,140 @@ class SiteKinematics:
 
     Raises:
         UnknownName: If a site is not in the model; carries its sites.
-        BadValue: If a chain has a joint of another kind, or two joints on one body.
+        BadValue: If a body on the way has a ball joint, or two joints.
     """
 
     def __init__(self, model: mujoco.MjModel, sites: tuple[str, ...]) -> None:
         known = [model.site(i).name for i in range(model.nsite)]
-        self._ends: dict[str, tuple[list[_Link], np.ndarray, np.ndarray]] = {}
-        links: dict[int, _Link] = {}
+        self._sites: dict[str, tuple[int, np.ndarray]] = {}
+        chains: dict[str, list[int]] = {}
         for name in sites:
             if name not in known:
                 raise UnknownName("site", name, known)
             site = model.site(name)
-            chain = _make_chain(model, int(site.bodyid[0]), links)
-            self._ends[name] = (chain, site.pos.copy(), site.quat.copy())
+            body = int(site.bodyid[0])
+            self._sites[name] = (body, _make_transform(site.pos, site.quat))
+            chains[name] = _find_chain(model, body)
+        self._chains = chains
+        bodies = sorted({body for chain in chains.values() for body in chain})
+        for body in bodies:
+            _check_body(model, body)
+        self._parent = {body: int(model.body_parentid[body]) for body in bodies}
+        self._fixed = {
+            body: _make_transform(model.body_pos[body], model.body_quat[body]) for body in bodies
+        }
+        self._free = {
+            body: int(model.jnt_qposadr[model.body_jntadr[body]])
+            for body in bodies
+            if model.body_jntnum[body] and model.jnt_type[model.body_jntadr[body]] == _FREE
+        }
+        self._moving = [
+            body for body in bodies if model.body_jntnum[body] and body not in self._free
+        ]
+        self._row = {body: row for row, body in enumerate(self._moving)}
+        joints = [int(model.body_jntadr[body]) for body in self._moving]
+        self._address = model.jnt_qposadr[joints]
+        self._slides = model.jnt_type[joints] == _SLIDE
+        axes = model.jnt_axis[joints]
+        self._axes = np.where(self._slides[:, None], axes, 0)
+        self._skew = np.stack([_make_skew(axis) for axis in axes])  # (J, 3, 3)
+        self._skew[self._slides] = 0
+        self._square = self._skew @ self._skew
+        self._fixed_moving = np.stack([self._fixed[body] for body in self._moving])  # (J, 4, 4)
+
+    def compute_transforms(
+        self, qpos: np.ndarray, sites: tuple[str, ...] = ()
+    ) -> dict[str, np.ndarray]:
+        """Homogeneous transforms of `sites` (all by default). (..., nq) -> (..., 4, 4)."""
+        sites = sites or tuple(self._sites)
+        shape = qpos.shape[:-1]
+        flat = qpos.reshape(-1, qpos.shape[-1])
+        needed = sorted({body for site in sites for body in self._chains[site]})
+        local = self._compute_local(flat, [body for body in needed if body in self._row])
+        world: dict[int, np.ndarray] = {}
+        for body in needed:
+            if body in self._free:
+                world[body] = _make_transforms(flat[:, self._free[body] :][:, :7])
+                continue
+            own = local[body] if body in local else self._fixed[body]
+            parent = self._parent[body]
+            world[body] = world[parent] @ own if parent else np.broadcast_to(own, (len(flat), 4, 4))
+        return {
+            site: (world[self._sites[site][0]] @ self._sites[site][1]).reshape(*shape, 4, 4)
+            for site in sites
+        }
+
+    def compute_positions(
+        self, qpos: np.ndarray, sites: tuple[str, ...] = ()
+    ) -> dict[str, np.ndarray]:
+        """World positions of `sites` [m]. Shape (..., nq) -> (..., 3) each."""
+        transforms = self.compute_transforms(qpos, sites)
+        return {site: transform[..., :3, 3] for site, transform in transforms.items()}
 
     def compute_poses(self, qpos: np.ndarray, sites: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
-        """World poses x y z qw qx qy qz of `sites`, of all by default. (..., nq) -> (..., 7)."""
-        bodies: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        poses = {}
-        for name in sites or self._ends:
-            chain, site_pos, site_quat = self._ends[name]
-            pos = np.zeros((*qpos.shape[:-1], 3))
-            quat = np.broadcast_to(np.array([1.0, 0, 0, 0]), (*qpos.shape[:-1], 4))
-            for link in chain:
-                key = id(link)
-                if key not in bodies:
-                    bodies[key] = _move(link, qpos, pos, quat)
-                pos, quat = bodies[key]
-            poses[name] = make_pose(
-                pos + quat_rotate(quat, site_pos), quat_multiply(quat, site_quat)
-            )
-        return poses
+        """World poses x y z qw qx qy qz of `sites`. Shape (..., nq) -> (..., 7) each."""
+        transforms = self.compute_transforms(qpos, sites)
+        return {
+            site: make_pose(transform[..., :3, 3], quat_from_matrix(transform[..., :3, :3]))
+            for site, transform in transforms.items()
+        }
+
+    def _compute_local(self, qpos: np.ndarray, bodies: list[int]) -> dict[int, np.ndarray]:
+        """Transform of each body to its parent, all joints at once. Shapes (n, 4, 4)."""
+        if not bodies:
+            return {}
+        rows = [self._row[body] for body in bodies]
+        angles = qpos[:, self._address[rows]].T  # (J, n)
+        joint = np.zeros((len(rows), len(qpos), 4, 4))
+        sine, cosine = np.sin(angles)[..., None, None], np.cos(angles)[..., None, None]
+        joint[..., :3, :3] = (
+            np.eye(3) + sine * self._skew[rows, None] + (1 - cosine) * self._square[rows, None]
+        )
+        joint[..., :3, 3] = angles[..., None] * self._axes[rows, None]
+        joint[..., 3, 3] = 1
+        local = self._fixed_moving[rows, None] @ joint
+        return dict(zip(bodies, local, strict=True))
 
 
-def _make_chain(model: mujoco.MjModel, body: int, links: dict[int, _Link]) -> list[_Link]:
-    """Links from the world to `body`; `links` lets chains share, and so compute, each once."""
-    chain: list[_Link] = []
+def _find_chain(model: mujoco.MjModel, body: int) -> list[int]:
+    """Bodies from the world (excluded) to `body`."""
+    chain = []
     while body:
-        chain.append(links.setdefault(body, _make_link(model, body)))
+        chain.append(body)
         body = int(model.body_parentid[body])
     return chain[::-1]
 
 
-def _make_link(model: mujoco.MjModel, body: int) -> _Link:
-    count = int(model.body_jntnum[body])
+def _check_body(model: mujoco.MjModel, body: int) -> None:
+    name, count = model.body(body).name, int(model.body_jntnum[body])
     if count > 1:
-        raise BadValue(f"body '{model.body(body).name}' has {count} joints, expected at most 1")
-    joint = int(model.body_jntadr[body]) if count else -1
-    kind = int(model.jnt_type[joint]) if count else -1
-    if kind == mujoco.mjtJoint.mjJNT_BALL:
-        raise BadValue(f"joint '{model.joint(joint).name}' is a ball joint, which is not supported")
-    return _Link(
-        pos=model.body_pos[body].copy(),
-        quat=model.body_quat[body].copy(),
-        joint=kind,
-        address=int(model.jnt_qposadr[joint]) if count else -1,
-        axis=model.jnt_axis[joint].copy() if count else np.zeros(3),
-        anchor=model.jnt_pos[joint].copy() if count else np.zeros(3),
-    )
+        raise BadValue(f"body '{name}' has {count} joints, expected at most 1")
+    if count:
+        joint = int(model.body_jntadr[body])
+        if model.jnt_type[joint] not in (_HINGE, _SLIDE, _FREE):
+            raise BadValue(f"joint '{model.joint(joint).name}' must be free, hinge or slide")
+        if model.jnt_pos[joint].any():
+            raise BadValue(f"joint '{model.joint(joint).name}' must sit at its body's origin")
 
 
-def _move(
-    link: _Link, qpos: np.ndarray, pos: np.ndarray, quat: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a body from that of its parent and the value of its joint."""
-    if link.joint == mujoco.mjtJoint.mjJNT_FREE:
-        address = link.address
-        return qpos[..., address : address + 3], qpos[..., address + 3 : address + 7]
-    pos = pos + quat_rotate(quat, link.pos)
-    quat = quat_multiply(quat, link.quat)
-    if link.joint == mujoco.mjtJoint.mjJNT_SLIDE:
-        return pos + quat_rotate(quat, link.axis) * qpos[..., link.address, None], quat
-    if link.joint == mujoco.mjtJoint.mjJNT_HINGE:
-        half = qpos[..., link.address, None] / 2
-        turned = quat_multiply(quat, np.concatenate([np.cos(half), np.sin(half) * link.axis], -1))
-        if link.anchor.any():
-            pos = pos + quat_rotate(quat, link.anchor) - quat_rotate(turned, link.anchor)
-        quat = turned
-    return pos, quat
+def _make_skew(axis: np.ndarray) -> np.ndarray:
+    x, y, z = axis
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=float)
+
+
+def _make_transform(pos: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    return _make_transforms(np.concatenate([pos, quat])[None])[0]
+
+
+def _make_transforms(poses: np.ndarray) -> np.ndarray:
+    """Homogeneous transforms of poses. Shape (n, 7) -> (n, 4, 4)."""
+    w, x, y, z = poses[:, 3:].T
+    transforms = np.zeros((len(poses), 4, 4))
+    transforms[:, 0, 0], transforms[:, 0, 1] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z)
+    transforms[:, 0, 2], transforms[:, 1, 0] = 2 * (x * z + w * y), 2 * (x * y + w * z)
+    transforms[:, 1, 1], transforms[:, 1, 2] = 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    transforms[:, 2, 0], transforms[:, 2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
+    transforms[:, 2, 2] = 1 - 2 * (x * x + y * y)
+    transforms[:, :3, 3] = poses[:, :3]
+    transforms[:, 3, 3] = 1
+    return transforms

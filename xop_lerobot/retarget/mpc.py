@@ -69,9 +69,8 @@ class MpcRetargeter(Retargeter):
         self.sites = {name: morphology.frames[name] for name in frames}
         obstacles = make_obstacles(model)
         hull = morphology.hull_points if obstacles else {}
-        self.kinematics = SiteKinematics(
-            model, tuple({*self.sites.values(), *morphology.contact_points, *hull})
-        )
+        self._points = tuple(dict.fromkeys((*morphology.contact_points, *hull)))
+        self.kinematics = SiteKinematics(model, (*self.sites.values(), *self._points))
         self.proposal = KinematicProposal(self.command_model, self.kinematics, self.sites)
         standing_height = float(morphology.standing_qpos()[2])
         self.costs: tuple[Cost, ...] = (
@@ -210,19 +209,20 @@ class MpcRetargeter(Retargeter):
             prediction.qpos[:, -1], prediction.commands[:, -1], config.extrapolation_s, goal.mode
         )
         terminal = self.kinematics.compute_poses(extrapolated, tuple(sites.values()))
+        poses = self.kinematics.compute_poses(prediction.qpos, tuple(sites.values()))
         last = config.horizon * POLICY_DT + config.extrapolation_s
         evaluation = Evaluation(
             qpos=prediction.qpos,
             qvel=prediction.qvel,
             commands=prediction.commands,
             reference=reference,
-            poses=self.kinematics.compute_poses(prediction.qpos),
+            poses={name: poses[site] for name, site in sites.items()},
+            points=self.kinematics.compute_positions(prediction.qpos, self._points),
             goals=goals,
             terminal_poses={name: terminal[site] for name, site in sites.items()},
             terminal_goals={
                 name: poses[0] for name, poses in self._preview(goal, _at(last), config).items()
             },
-            sites=sites,
             mode=goal.mode,
             dt=POLICY_DT,
             weights=config.weights,

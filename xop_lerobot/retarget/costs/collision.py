@@ -43,13 +43,13 @@ def make_obstacles(model: mujoco.MjModel) -> tuple[Obstacle, ...]:
     Round geoms count by their bounding box in their own frame.
     """
     obstacles = []
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
     for i in range(model.ngeom):
         fixed = model.body_weldid[model.geom_bodyid[i]] == 0
         collides = model.geom_contype[i] or model.geom_conaffinity[i]
         if not fixed or not collides or model.geom_type[i] == mujoco.mjtGeom.mjGEOM_PLANE:
             continue
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
         quat = np.empty(4)
         mujoco.mju_mat2Quat(quat, data.geom_xmat[i])
         centre, half = model.geom_aabb[i, :3], model.geom_aabb[i, 3:]
@@ -87,7 +87,7 @@ class CollisionCost(Cost):
         """Cost of every sample. Shape (K,)."""
         if not self.obstacles or not self.points:
             return np.zeros(len(evaluation.qpos))
-        hull = np.stack([evaluation.poses[site][:, 1:, :3] for site in self.points], axis=-2)
+        hull = np.stack([evaluation.points[site][:, 1:] for site in self.points], axis=-2)
         radii = np.array(list(self.points.values()))
         speed = np.square(evaluation.qvel[:, 1:, :2]).sum(-1)
         weights = evaluation.weights

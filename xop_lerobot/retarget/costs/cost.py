@@ -21,11 +21,11 @@ class Evaluation:
         qvel: Predicted velocities. Shape (K, H + 1, nv).
         commands: Commands rolled out. Shape (K, H, k).
         reference: The command that costs nothing. Shape (k,).
-        poses: Predicted pose of every site in use. Shapes (K, H + 1, 7).
+        poses: Predicted pose of each tracked frame. Shapes (K, H + 1, 7).
+        points: Predicted position of contact and hull sites. Shapes (K, H + 1, 3).
         goals: Goal of each tracked frame at every step. Shapes (H + 1, 7).
         terminal_poses: Pose of each tracked frame at the end of the extrapolation. (K, 7).
         terminal_goals: Goal of each tracked frame then. Shapes (7,).
-        sites: Site of each tracked frame.
         mode: Mode of the robot.
         dt: Time between steps [s].
         weights: The weights.
@@ -36,10 +36,10 @@ class Evaluation:
     commands: np.ndarray
     reference: np.ndarray
     poses: Mapping[str, np.ndarray]
+    points: Mapping[str, np.ndarray]
     goals: Mapping[str, np.ndarray]
     terminal_poses: Mapping[str, np.ndarray]
     terminal_goals: Mapping[str, np.ndarray]
-    sites: Mapping[str, str]
     mode: Mode
     dt: float
     weights: CostWeights

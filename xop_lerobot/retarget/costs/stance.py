@@ -32,7 +32,7 @@ class StanceCost(Cost):
             return np.zeros(len(evaluation.qpos))
         points = np.stack(
             [
-                np.stack([evaluation.poses[site][..., :3] for site in group], axis=-2)
+                np.stack([evaluation.points[site] for site in group], axis=-2)
                 for group in self.groups
             ]
         )  # (groups, K, H + 1, points, 3)

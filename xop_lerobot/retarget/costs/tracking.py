@@ -21,7 +21,7 @@ class TrackingCost(Cost):
         """Cost of every sample. Shape (K,)."""
         total = np.zeros(len(evaluation.qpos))
         for name, goals in evaluation.goals.items():
-            poses = evaluation.poses[evaluation.sites[name]][:, 1:]
+            poses = evaluation.poses[name][:, 1:]
             total += compute_tracking(poses, goals[1:], evaluation.weights).mean(axis=1)
         return total
 
