@@ -7,7 +7,7 @@ Rows are plain data, so that a robot's numbers cost nothing to import; MuJoCo is
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -97,6 +97,26 @@ class Shape:
     material: str | None = None
     collides: bool = True
     name: str = ""
+
+
+def mirror(shape: Shape) -> Shape:
+    """Return the right-hand twin of a left-hand shape (y to -y)."""
+    x, y, z = shape.pos
+    roll, pitch, yaw = shape.rpy
+    ends = shape.ends
+    return replace(
+        shape,
+        link=shape.link.replace("left", "right"),
+        name=shape.name.replace("left", "right"),
+        pos=(x, -y, z),
+        rpy=(-roll, pitch, -yaw),
+        ends=ends and (ends[0], -ends[1], ends[2], ends[3], -ends[4], ends[5]),
+    )
+
+
+def look(link: str, kind: str, size: tuple[float, ...], material: str, **where: object) -> Shape:
+    """Return a shape that is seen and collides with nothing."""
+    return Shape(link, kind, size, material=material, collides=False, **where)
 
 
 @dataclass(frozen=True)
@@ -263,3 +283,15 @@ def add_servo(
     actuator.forcelimited, actuator.forcerange = True, (-force, force)
     if joint.limits is not None:
         actuator.ctrllimited, actuator.ctrlrange = True, joint.limits
+
+
+def add_imu(spec: mujoco.MjSpec) -> None:
+    """Add the inertial sensors at the site `imu`."""
+    import mujoco  # noqa: PLC0415
+
+    for name, kind in (
+        ("imu_quat", mujoco.mjtSensor.mjSENS_FRAMEQUAT),
+        ("imu_gyro", mujoco.mjtSensor.mjSENS_GYRO),
+        ("imu_acc", mujoco.mjtSensor.mjSENS_ACCELEROMETER),
+    ):
+        spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")

@@ -107,9 +107,7 @@ def add_sky(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.ambient = (0.38,) * 3
     spec.visual.headlight.diffuse = (0.22,) * 3
     spec.visual.headlight.specular = (0,) * 3
-    # `global` is a keyword of the language.
-    overall = getattr(spec.visual, "global_")
-    overall.offwidth, overall.offheight = OFFSCREEN
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = OFFSCREEN
     spec.visual.quality.offsamples = 0
     spec.visual.quality.shadowsize = 0
     spec.visual.map.znear = 0.01

@@ -97,7 +97,7 @@ def build_g1(kind: str) -> mujoco.MjSpec:
         for camera in shapes.WRIST_CAMERAS:
             rows.add_camera(spec, camera, shapes.WRIST_FOVY)
         rows.add_camera(spec, shapes.SCENE_CAMERA, shapes.SCENE_FOVY, tracking=True)
-        add_imu(spec)
+        rows.add_imu(spec)
     return spec
 
 
@@ -118,15 +118,3 @@ def add_feet(spec: mujoco.MjSpec) -> None:
                 conaffinity=FLOOR_BIT,
                 group=3,
             )
-
-
-def add_imu(spec: mujoco.MjSpec) -> None:
-    """Add the torso's inertial sensors."""
-    import mujoco  # noqa: PLC0415
-
-    for name, kind in (
-        ("imu_quat", mujoco.mjtSensor.mjSENS_FRAMEQUAT),
-        ("imu_gyro", mujoco.mjtSensor.mjSENS_GYRO),
-        ("imu_acc", mujoco.mjtSensor.mjSENS_ACCELEROMETER),
-    ):
-        spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")

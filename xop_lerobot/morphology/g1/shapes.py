@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from xop_lerobot.morphology.links import Frame, Shape
+from xop_lerobot.morphology.links import Frame, Shape, look, mirror
 
 MATERIALS = {
     "shell": (0.86, 0.87, 0.88, 0.3),
@@ -14,26 +12,6 @@ MATERIALS = {
     "light": (0.45, 0.75, 0.95, 0.1),
 }
 """Red, green, blue, gloss."""
-
-
-def mirror(shape: Shape) -> Shape:
-    """Return the right-hand twin of a left-hand shape (y to -y)."""
-    x, y, z = shape.pos
-    roll, pitch, yaw = shape.rpy
-    ends = shape.ends
-    return replace(
-        shape,
-        link=shape.link.replace("left", "right"),
-        name=shape.name.replace("left", "right"),
-        pos=(x, -y, z),
-        rpy=(-roll, pitch, -yaw),
-        ends=ends and (ends[0], -ends[1], ends[2], ends[3], -ends[4], ends[5]),
-    )
-
-
-def look(link: str, kind: str, size: tuple[float, ...], material: str, **where: object) -> Shape:
-    """Return a shape that is seen and collides with nothing."""
-    return Shape(link, kind, size, material=material, collides=False, **where)
 
 
 BODY = (

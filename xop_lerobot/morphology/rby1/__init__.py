@@ -1,0 +1,99 @@
+"""Rainbow Robotics RB-Y1 A v1.2: a wheeled base, a torso of six joints, two arms of seven."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.command import CommandDim, CommandSpace, Mode
+from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
+from xop_lerobot.morphology.rby1.links import LINKS
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from xop_lerobot.retarget.config import MpcConfig
+
+TORSO_READY = tuple(math.radians(angle) for angle in (0, 45, -90, 45, 0, 0))
+"""Torso angles at the ready pose [rad]."""
+
+ARM_READY = tuple(math.radians(angle) for angle in (0, 5, 0, -120, 0, 45, 0))
+"""Left arm angles at the ready pose [rad]; joints 0, 2, 4 and 6 are 0, joint 1 is mirrored."""
+
+TORSO_RATE = 1.5
+"""Largest rate of a torso command [rad/s]; the joints allow 2.09 and 3.14."""
+
+BASE_HEIGHT = -0.0006
+"""Height of the base frame at rest [m]: wheels and casters sink in by their compliance."""
+
+GRIPPER_OPEN = 0.05
+"""Opening of one finger [m]."""
+
+
+def _make_torso_dims() -> tuple[CommandDim, ...]:
+    """Return the torso's command entries, with the limits of the joint table."""
+    joints = {link.joint.name: link.joint for link in LINKS if link.joint is not None}
+    dims = []
+    for i, ready in enumerate(TORSO_READY):
+        low, high = joints[f"torso_{i}"].limits or (-math.pi, math.pi)
+        name = f"torso_{i}"
+        dims.append(CommandDim(name, f"{name}.pos", "rad", low, high, ready, TORSO_RATE))
+    return tuple(dims)
+
+
+@MORPHOLOGIES.register("rby1")
+class RBY1(Morphology):
+    """RB-Y1 with the command space V1: base velocity and torso joints."""
+
+    name = "rby1"
+    command_space = CommandSpace(
+        (
+            CommandDim("v", "x.vel", "m/s", -1.0, 1.0, 0.0, 1.5, mobile_only=True),
+            CommandDim("yaw_rate", "theta.vel", "rad/s", -1.5, 1.5, 0.0, 3.0, mobile_only=True),
+            *_make_torso_dims(),
+        )
+    )
+    policies = ("diff_drive",)
+    frames = {"head": "head", "left_wrist": "left_wrist", "right_wrist": "right_wrist"}
+    base_body = "base"
+    arms = tuple(
+        ArmChain(
+            f"{side}_wrist",
+            tuple(f"{side}_arm_{i}" for i in range(len(ARM_READY))),
+            f"{side}_gripper",
+            (0.0, GRIPPER_OPEN),
+        )
+        for side in ("left", "right")
+    )
+    arm_rest = {
+        f"{side}_arm_{i}": -angle if side == "right" and i == 1 else angle
+        for side in ("left", "right")
+        for i, angle in enumerate(ARM_READY)
+    }
+    contact_points = ("left_wheel_center", "right_wheel_center")
+    fall_height = -0.2
+    fall_tilt = 0.35
+    wheeled = True
+
+    def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
+        """Build RB-Y1 alone."""
+        from xop_lerobot.morphology.rby1.model import build_rby1  # noqa: PLC0415
+
+        return build_rby1(kind)
+
+    def standing_qpos(self) -> np.ndarray:
+        """Stand at the ready pose with open grippers: free joint, then the joints. Shape (35,)."""
+        angles = dict(self.arm_rest)
+        angles |= {f"torso_{i}": ready for i, ready in enumerate(TORSO_READY)}
+        angles |= {f"gripper_finger_{side}1": -GRIPPER_OPEN for side in "lr"}
+        angles |= {f"gripper_finger_{side}2": GRIPPER_OPEN for side in "lr"}
+        joints = [angles.get(link.joint.name, 0.0) for link in LINKS if link.joint is not None]
+        return np.array([0.0, 0, BASE_HEIGHT, 1, 0, 0, 0, *joints])
+
+    def mpc_config(self, mode: Mode) -> MpcConfig:
+        """Parameters of the model predictive controller in `mode`."""
+        from xop_lerobot.morphology.rby1.mpc import mpc_config  # noqa: PLC0415
+
+        return mpc_config(mode)

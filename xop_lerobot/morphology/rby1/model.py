@@ -1,0 +1,157 @@
+"""RB-Y1 as a MuJoCo model, put together from its tables."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from xop_lerobot.morphology import links as rows
+from xop_lerobot.morphology.links import FLOOR_BIT, Joint
+from xop_lerobot.morphology.rby1 import shapes
+from xop_lerobot.morphology.rby1.links import LINKS
+
+if TYPE_CHECKING:
+    import mujoco
+
+TIMESTEP = 0.005
+"""Physics step [s]."""
+
+FULL_TORQUE_ERROR = 0.01
+"""Position error at which a torso or arm servo gives its rated torque [rad]: the stiffness of a
+joint is its effort over this error, so its sag under gravity is at most 0.01 rad."""
+
+INERTIA = {
+    "torso_0": 30.0, "torso_1": 28.0, "torso_2": 14.0, "torso_3": 6.0, "torso_4": 6.0,
+    "torso_5": 3.0,
+    "arm_0": 1.0, "arm_1": 0.9, "arm_2": 0.5, "arm_3": 0.5, "arm_4": 0.2, "arm_5": 0.2,
+    "arm_6": 0.1,
+}  # fmt: skip
+"""Inertia that each joint moves at the ready pose, rotor included [kg m^2]: it sets the damping."""
+
+ARMATURE = {"torso": 1.0, "arm": 0.1, "head": 0.05, "wheel": 0.05, "finger": 0.1}
+"""Reflected rotor inertia by kind of joint [kg m^2], of a finger [kg]; estimates."""
+
+JOINT_DAMPING = 0.5
+"""Viscous friction of torso, arms and head [N m s/rad]."""
+
+WHEEL_GAIN = 30.0
+"""Wheel torque per speed error [N m s/rad]: 22 ms to follow a speed."""
+
+HEAD_GAINS = (50.0, 3.0)
+"""k_p [N m/rad], k_d [N m s/rad]."""
+
+FINGER_GAINS = (1500.0, 60.0)
+"""k_p [N/m], k_d [N s/m]: 75 N when an opening of 5 cm is blocked shut."""
+
+DRIVEN_FINGERS = {"gripper_finger_r2": "right_gripper", "gripper_finger_l2": "left_gripper"}
+"""Fingers with a motor, and the motor's name; the other finger of a hand mirrors it."""
+
+
+def compute_gains(joint: Joint) -> tuple[float, float]:
+    r"""Servo gains of a torso or arm joint.
+
+    :math:`k_p = \tau_{max} / e`, :math:`k_d = 2\sqrt{k_p I}`: critical damping of the inertia I.
+
+    Returns:
+        k_p [N m/rad] and k_d [N m s/rad].
+    """
+    stiffness = joint.effort / FULL_TORQUE_ERROR
+    inertia = INERTIA[joint.name.removeprefix("left_").removeprefix("right_")]
+    return stiffness, 2 * math.sqrt(stiffness * inertia)
+
+
+def build_rby1(kind: str) -> mujoco.MjSpec:
+    """Build RB-Y1 alone.
+
+    The planning model has wheels and casters alone, which meet the floor, no visuals, no
+    cameras, no sensors.
+
+    Args:
+        kind: ``"full"`` or ``"planning"``.
+    """
+    import mujoco  # noqa: PLC0415
+
+    planning = kind == "planning"
+    spec = rows.new_spec("rby1", TIMESTEP, planning)
+    # The servos' damping is taken implicitly, which keeps stiff joints stable at this step.
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    rows.add_links(spec, LINKS, "base_joint")
+    for link in LINKS:
+        if link.joint is not None:
+            add_motor(spec, link.joint)
+    add_grippers(spec)
+    rows.add_sites(spec, shapes.SITES)
+    add_wheels(spec)
+    if not planning:
+        rows.add_materials(spec, shapes.MATERIALS)
+        rows.add_shapes(spec, shapes.SHAPES)
+        for first, second in shapes.EXCLUDED:
+            spec.add_exclude(bodyname1=first, bodyname2=second)
+        rows.add_camera(spec, shapes.HEAD_CAMERA, shapes.HEAD_FOVY)
+        for camera in shapes.WRIST_CAMERAS:
+            rows.add_camera(spec, camera, shapes.WRIST_FOVY)
+        rows.add_camera(spec, shapes.SCENE_CAMERA, shapes.SCENE_FOVY, tracking=True)
+        rows.add_imu(spec)
+    return spec
+
+
+def add_motor(spec: mujoco.MjSpec, row: Joint) -> None:
+    """Give a joint its armature, friction and motor; grippers come after all others."""
+    import mujoco  # noqa: PLC0415
+
+    joint = spec.joint(row.name)
+    part = next(part for part in ARMATURE if part in row.name)
+    joint.armature = ARMATURE[part]
+    if part == "wheel":
+        wheel = spec.add_actuator(name=row.name, target=row.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        wheel.set_to_velocity(kv=WHEEL_GAIN)
+        wheel.forcelimited, wheel.forcerange = True, (-row.effort, row.effort)
+        wheel.ctrllimited, wheel.ctrlrange = True, (-row.velocity, row.velocity)
+    elif part == "head":
+        joint.damping = (JOINT_DAMPING, 0, 0)
+        rows.add_servo(spec, row, *HEAD_GAINS)
+    elif part != "finger":
+        joint.damping = (JOINT_DAMPING, 0, 0)
+        rows.add_servo(spec, row, *compute_gains(row))
+
+
+def add_grippers(spec: mujoco.MjSpec) -> None:
+    """Add one motor a hand, whose target is the opening of one finger [m]."""
+    import mujoco  # noqa: PLC0415
+
+    joints = {link.joint.name: link.joint for link in LINKS if link.joint is not None}
+    for driven, name in sorted(DRIVEN_FINGERS.items()):
+        rows.add_servo(spec, joints[driven], *FINGER_GAINS, name=name)
+        mirrored = driven[:-1] + "1"
+        equality = spec.add_equality(
+            name=name,
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=mirrored,
+            name2=driven,
+        )
+        equality.data[:5] = (0, -1, 0, 0, 0)
+
+
+def add_wheels(spec: mujoco.MjSpec) -> None:
+    """Add what stands on the floor: a wheel touches in one point, a caster slides freely."""
+    import mujoco  # noqa: PLC0415
+
+    floor_only = {"contype": 0, "conaffinity": FLOOR_BIT, "mass": 0, "priority": 1, "group": 3}
+    for side in ("left", "right"):
+        spec.body(f"wheel_{side[0]}").add_geom(
+            name=f"{side}_wheel",
+            type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+            size=(shapes.WHEEL_RADIUS, 0.03, shapes.WHEEL_RADIUS),
+            friction=(1.0, 0.005, 0.0001),
+            **floor_only,
+        )
+    for name, pos in shapes.CASTERS.items():
+        spec.body("base").add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=(shapes.CASTER_RADIUS, 0, 0),
+            pos=pos,
+            condim=1,
+            **floor_only,
+        )
