@@ -1,0 +1,148 @@
+"""Pictures of a simulation, by OpenGL in software where there is no graphics card."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import AbstractContextManager, nullcontext
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.errors import UnknownName
+from xop_lerobot.plant.gl import GlContext, make_gl_context
+
+MAX_GEOMS = 2000
+_COSTLY = (
+    mujoco.mjtRndFlag.mjRND_SHADOW,
+    mujoco.mjtRndFlag.mjRND_REFLECTION,
+    mujoco.mjtRndFlag.mjRND_FOG,
+    mujoco.mjtRndFlag.mjRND_HAZE,
+)
+"""Effects that cost a software renderer more than all else, and teach a policy nothing."""
+
+
+class Cameras:
+    """The cameras of a model.
+
+    An OpenGL context belongs to one thread, so each thread that asks for a picture gets its own
+    renderer, made at its first picture. The picture is computed from a copy of the position:
+    rendering never writes to the physics, and a seed gives the same run with cameras or without.
+
+    Args:
+        model: Model with named cameras.
+        width: Width of a picture [pixel].
+        height: Height of a picture [pixel].
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int = 320, height: int = 240) -> None:
+        self._model = model
+        self.width, self.height = width, height
+        self.names = tuple(model.cam(i).name or f"camera {i}" for i in range(model.ncam))
+        # The context takes both from the model: its buffer must hold the picture, and smoothing
+        # edges by four samples a pixel costs four times the work of a software renderer.
+        visual = model.vis
+        visual.global_.offwidth = max(visual.global_.offwidth, width)
+        visual.global_.offheight = max(visual.global_.offheight, height)
+        visual.quality.offsamples = 0
+        self._threads = threading.local()
+        self._renderers: dict[int, _Renderer] = {}
+
+    def check_camera(self, camera: str) -> int:
+        """Return the id of `camera`.
+
+        Raises:
+            UnknownName: Listing the cameras.
+        """
+        if camera not in self.names:
+            raise UnknownName("camera", camera, self.names)
+        return self.names.index(camera)
+
+    def render(
+        self, camera: str, data: mujoco.MjData, lock: AbstractContextManager[object] | None = None
+    ) -> np.ndarray:
+        """Render what `camera` sees of the positions in `data`, which is only read.
+
+        Args:
+            camera: Name of the camera.
+            data: Physics to look at.
+            lock: Held while the positions are copied, where another thread steps them.
+
+        Returns:
+            Fresh picture. Shape (height, width, 3), uint8.
+
+        Raises:
+            UnknownName: Listing the cameras.
+            RenderingUnavailable: If this machine has no OpenGL for it.
+        """
+        index = self.check_camera(camera)
+        renderer: _Renderer | None = getattr(self._threads, "renderer", None)
+        if renderer is None:
+            renderer = _Renderer(self._model, self.width, self.height)
+            self._threads.renderer = renderer
+            self._renderers[threading.get_ident()] = renderer
+        with lock or nullcontext():
+            renderer.copy_positions(data)
+        return renderer.render(index)
+
+    def close(self) -> None:
+        """Release this thread's renderer; those of other threads go when their threads end."""
+        renderer = self._renderers.pop(threading.get_ident(), None)
+        if renderer is not None:
+            renderer.close()
+        self._threads = threading.local()
+
+
+class _Renderer:
+    """OpenGL context, scene and scratch data of one thread."""
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        self._model = model
+        self._data = mujoco.MjData(model)
+        self._gl: GlContext | None = make_gl_context(width, height)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=max(MAX_GEOMS, 2 * model.ngeom))
+        for flag in _COSTLY:
+            self._scene.flags[flag] = False
+        self._option = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+
+    def copy_positions(self, data: mujoco.MjData) -> None:
+        """Take over all that positions follow from."""
+        self._data.qpos[:] = data.qpos
+        self._data.mocap_pos[:] = data.mocap_pos
+        self._data.mocap_quat[:] = data.mocap_quat
+
+    def render(self, camera: int) -> np.ndarray:
+        """Picture of the positions copied last. Shape (height, width, 3), uint8."""
+        if self._gl is None:
+            raise RuntimeError("the renderer is closed")
+        self._gl.make_current()
+        scratch = self._data
+        mujoco.mj_kinematics(self._model, scratch)
+        mujoco.mj_comPos(self._model, scratch)
+        mujoco.mj_camlight(self._model, scratch)
+        self._camera.fixedcamid = camera
+        mujoco.mjv_updateScene(
+            self._model,
+            scratch,
+            self._option,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        picture = np.empty((self._rect.height, self._rect.width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(picture, None, self._rect, self._context)
+        return np.ascontiguousarray(picture[::-1])  # OpenGL counts rows from the bottom
+
+    def close(self) -> None:
+        """Release the context; may be called twice."""
+        if self._gl is not None:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
+            self._gl = None
