@@ -370,7 +370,7 @@ def install_all() -> None:
 
 def write_lock() -> None:
     """Write the installed versions to `requirements.lock`, below its opening comment."""
-    skipped = [f"--exclude={name}" for name in (DISTRIBUTION, "pip", "wheel", "nodeenv")]
+    skipped = [f"--exclude={name}" for name in (DISTRIBUTION, "pip", "wheel")]
     frozen = subprocess.run(
         [PYTHON, "-I", "-m", "pip", "freeze", "--exclude-editable", *skipped],
         capture_output=True,

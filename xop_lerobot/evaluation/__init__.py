@@ -1,0 +1,1 @@
+"""How well an episode went: figures, tables and pictures."""

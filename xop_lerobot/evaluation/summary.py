@@ -1,0 +1,196 @@
+"""Figures of one recorded episode, computed from the dataset's own columns, and their table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from xop_lerobot.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.transforms import quat_rotate
+
+if TYPE_CHECKING:
+    from xop_lerobot.morphology.morphology import Morphology
+
+END_S = 0.5
+"""The error "at the end" is the mean over this last part of the engaged time [s]."""
+POSE_SIZE = 7
+HEALTH = "retargeter.health"
+SOLVE_TIME = "solve_time"
+
+
+@dataclass(frozen=True)
+class EpisodeSummary:
+    """Figures of one episode.
+
+    Attributes:
+        robot: Name of the robot.
+        frames: Frames in the episode.
+        duration_s: Their time, frames over fps [s].
+        engaged_s: Time in which the operator drove [s].
+        head_error_mean: Mean distance of `robot.head` from `goal.head` while engaged [m].
+        head_error_end: Mean of it over the last `END_S` of the engaged time [m].
+        falls: How often the robot fell.
+        plan_ms_median: Median solve time of the retargeter [ms]; 0 if it never solved.
+        plan_ms_p99: 99th percentile of it [ms].
+    """
+
+    robot: str
+    frames: int
+    duration_s: float
+    engaged_s: float
+    head_error_mean: float
+    head_error_end: float
+    falls: int
+    plan_ms_median: float
+    plan_ms_p99: float
+
+
+def compute_distance(pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    r"""Compute :math:`\|p - p_{goal}\|` of two pose tracks. Shapes (T, 7) -> (T,) [m].
+
+    Raises:
+        BadShape: If one is no pose track, or their lengths differ.
+    """
+    pose, goal = np.asarray(pose, float), np.asarray(goal, float)
+    for name, track in (("pose", pose), ("goal", goal)):
+        if track.shape != (len(pose), POSE_SIZE):
+            raise BadShape(name, (len(pose), POSE_SIZE), track.shape)
+    return np.linalg.norm(pose[:, :3] - goal[:, :3], axis=1)
+
+
+def compute_falls(base_pose: np.ndarray, fall_height: float, fall_tilt: float) -> int:
+    r"""Count how often a base falls: lower than `fall_height` or tilted over `fall_tilt`.
+
+    The tilt is :math:`\arccos(e_z \cdot R e_z)`. A robot that stays down has fallen once.
+
+    Args:
+        base_pose: Base in the world. Shape (T, 7).
+        fall_height: Height under which it counts as fallen [m].
+        fall_tilt: Tilt over which it counts as fallen [rad].
+
+    Returns:
+        Number of times the robot went down.
+    """
+    base_pose = np.asarray(base_pose, float)
+    up = quat_rotate(base_pose[:, 3:], np.array([0.0, 0.0, 1.0]))
+    tilt = np.arccos(np.clip(up[:, 2], -1.0, 1.0))
+    down = (base_pose[:, 2] < fall_height) | (tilt > fall_tilt)
+    return int(np.count_nonzero(np.diff(down.astype(int), prepend=0) > 0))
+
+
+def compute_episode_summary(
+    columns: Mapping[str, np.ndarray],
+    health_names: Sequence[str],
+    fps: int,
+    robot: str,
+    morphology: Morphology,
+) -> EpisodeSummary:
+    """Compute the figures of one episode.
+
+    Args:
+        columns: The episode's columns by key, one row a frame.
+        health_names: Names of the entries of `retargeter.health`.
+        fps: Frames per second.
+        robot: Name for the table.
+        morphology: The robot, for the bounds of a fall.
+
+    Raises:
+        UnknownName: If a column or the solve time is missing; lists what there is.
+        BadValue: If the operator never engaged.
+    """
+    engaged = np.asarray(_get_column(columns, "operator.engaged")).reshape(-1).astype(bool)
+    if not engaged.any():
+        raise BadValue(
+            f"{robot}: the operator never engaged in {len(engaged) / fps:.1f} s, so there is "
+            "nothing to compare. Was the episode too short?"
+        )
+    distance = compute_distance(
+        _get_column(columns, "robot.head"), _get_column(columns, "goal.head")
+    )[engaged]
+    if SOLVE_TIME not in health_names:
+        raise UnknownName("health figure", SOLVE_TIME, health_names)
+    solve = np.asarray(_get_column(columns, HEALTH), float)
+    solve_ms = 1e3 * solve[engaged, list(health_names).index(SOLVE_TIME)]
+    solve_ms = solve_ms[solve_ms > 0] if (solve_ms > 0).any() else np.zeros(1)
+    return EpisodeSummary(
+        robot=robot,
+        frames=len(engaged),
+        duration_s=len(engaged) / fps,
+        engaged_s=float(engaged.sum() / fps),
+        head_error_mean=float(distance.mean()),
+        head_error_end=float(distance[-max(1, round(END_S * fps)) :].mean()),
+        falls=compute_falls(
+            _get_column(columns, "robot.base_pose"), morphology.fall_height, morphology.fall_tilt
+        ),
+        plan_ms_median=float(np.median(solve_ms)),
+        plan_ms_p99=float(np.percentile(solve_ms, 99)),
+    )
+
+
+def read_columns(dataset: Any, episode: int = 0) -> dict[str, np.ndarray]:  # noqa: ANN401
+    """Read the one-dimensional columns of an episode of a `LeRobotDataset`.
+
+    Args:
+        dataset: A `lerobot.datasets.LeRobotDataset`; its videos are not decoded.
+        episode: Index of the episode.
+
+    Returns:
+        Every numeric column by key. Shapes (T,) or (T, n).
+
+    Raises:
+        BadValue: If the dataset has no such episode.
+    """
+    if not 0 <= episode < dataset.meta.total_episodes:
+        raise BadValue(
+            f"episode {episode} is not in '{dataset.root}', which has "
+            f"{dataset.meta.total_episodes} episodes"
+        )
+    rows = dataset.hf_dataset.with_format("numpy")
+    of_episode = np.flatnonzero(np.asarray(rows["episode_index"][:]).reshape(-1) == episode)
+    chosen = rows.select(of_episode)
+    skipped = {"image", "video", "string"}
+    return {
+        key: np.asarray(chosen[key][:])
+        for key, feature in dataset.meta.features.items()
+        if feature["dtype"] not in skipped and key in chosen.column_names
+    }
+
+
+def format_table(summaries: Sequence[EpisodeSummary]) -> str:
+    """Lay the figures out as a table for a terminal, one row an episode."""
+    header = (
+        *("robot", "frames", "duration [s]", "engaged [s]", "head error mean [m]"),
+        *("at the end [m]", "falls", "plan median [ms]", "plan p99 [ms]"),
+    )
+    rows = [
+        (
+            summary.robot,
+            str(summary.frames),
+            f"{summary.duration_s:.1f}",
+            f"{summary.engaged_s:.1f}",
+            f"{summary.head_error_mean:.3f}",
+            f"{summary.head_error_end:.3f}",
+            str(summary.falls),
+            f"{summary.plan_ms_median:.1f}",
+            f"{summary.plan_ms_p99:.1f}",
+        )
+        for summary in summaries
+    ]
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    rule = tuple("-" * width for width in widths)
+    lines = []
+    for row in (header, rule, *rows):
+        first, *others = zip(row, widths, strict=True)
+        cells = [first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in others)]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+def _get_column(columns: Mapping[str, np.ndarray], key: str) -> np.ndarray:
+    try:
+        return np.asarray(columns[key])
+    except KeyError:
+        raise UnknownName("column", key, columns) from None
