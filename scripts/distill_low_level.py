@@ -1,0 +1,303 @@
+"""Distil FALCON's G1 policy into the student that ships with the package.
+
+    python scripts/distill_low_level.py --teacher g1_29dof.onnx --seed 0 \\
+        --out xop_lerobot/low_level/weights/g1_student.npz --report student.json
+
+DAgger (Ross et al., 2011): many robots run in the planning model; each is driven by the teacher
+or by the student, the teacher's share falls from one to zero, and the student is trained on
+what the teacher would have done in every state that was met. Afterwards, and alone with
+``--evaluate-only``, student and teacher are compared on the same random sequences.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import logging
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from torch import nn
+
+from xop_lerobot.low_level.comparison import compare_policies, replace_table, write_table
+from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
+from xop_lerobot.low_level.falcon import Falcon
+from xop_lerobot.low_level.falcon_observation import (
+    MEMORY_SIZE,
+    NUM_JOINTS,
+    OBSERVATION_SIZE,
+    FalconLikePolicy,
+)
+from xop_lerobot.low_level.student import Student, save_weights
+from xop_lerobot.low_level.trial import BatchSimulation
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.scene import build_model
+
+logger = logging.getLogger("distill_low_level")
+
+TRAINING = ExcitationConfig(
+    height=(0.48, 0.80),
+    waist_yaw=1.1,
+    waist_roll=0.5,
+    waist_pitch=(-0.5, 0.5),
+    vx=1.0,
+    vy=0.6,
+    yaw_rate=1.0,
+    arm_range=0.95,
+    arm_speed=3.0,
+    push=0.6,
+    push_period=4.0,
+    hand_force=15.0,
+)
+"""Ranges of the training sequences: somewhat wider than what the robot is asked for."""
+
+EPISODE_STEPS = 1000
+BLOCK_STEPS = 50
+"""Steps for which one of teacher and student drives a robot before it is drawn again."""
+
+OUTPUT_WEIGHTS = np.ones(NUM_JOINTS)
+OUTPUT_WEIGHTS[13:15] = 0.1  # waist roll and pitch: only seen as a last action
+OUTPUT_WEIGHTS[15:] = 0.3  # arms: a small residual
+
+
+class Network(FalconLikePolicy):
+    """The student while it is trained: standardised inputs, ELU between the layers."""
+
+    name = "student in training"
+
+    def __init__(self, hidden: tuple[int, ...], observations: torch.Tensor) -> None:
+        self.mean = observations.mean(0)
+        spread = observations.std(0)
+        self.spread = torch.where(spread < 1e-4, torch.ones_like(spread), spread.clamp(min=0.02))  # noqa: PLR2004
+        sizes = (OBSERVATION_SIZE, *hidden, NUM_JOINTS)
+        layers: list[nn.Module] = []
+        for inputs, outputs in zip(sizes, sizes[1:], strict=False):
+            layers += [nn.Linear(inputs, outputs), nn.ELU()]
+        self.body = nn.Sequential(*layers[:-1])
+
+    def standardise(self, observation: torch.Tensor) -> torch.Tensor:
+        """Shift and scale observations, and cut off what is far out of the ordinary."""
+        return (observation - self.mean) / self.spread
+
+    def infer(self, observation: np.ndarray) -> np.ndarray:
+        """Run the network; see `FalconLikePolicy.infer`."""
+        with torch.no_grad():
+            return self.body(self.standardise(torch.from_numpy(observation))).numpy()
+
+    def layers(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return matrices (inputs, outputs) and offsets, the standardisation folded in."""
+        linear = [module for module in self.body if isinstance(module, nn.Linear)]
+        weights = [layer.weight.detach().double().T.clone() for layer in linear]
+        biases = [layer.bias.detach().double().clone() for layer in linear]
+        weights[0] /= self.spread.double()[:, None]
+        biases[0] -= self.mean.double() @ weights[0]
+        return [w.numpy() for w in weights], [b.numpy() for b in biases]
+
+
+class Experience:
+    """All observations met so far and the teacher's action in each, in half precision."""
+
+    def __init__(self, capacity: int) -> None:
+        self.observations = torch.empty((capacity, OBSERVATION_SIZE), dtype=torch.float16)
+        self.actions = torch.empty((capacity, NUM_JOINTS), dtype=torch.float16)
+        self.size = 0
+
+    def add(self, observations: np.ndarray, actions: np.ndarray) -> None:
+        """Append a batch."""
+        rows = slice(self.size, self.size + len(observations))
+        self.observations[rows] = torch.from_numpy(observations)
+        self.actions[rows] = torch.from_numpy(actions)
+        self.size += len(observations)
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw a random batch, float32."""
+        rows = torch.randint(0, self.size, (count,), generator=generator)
+        return self.observations[rows].float(), self.actions[rows].float()
+
+
+class Collector:
+    """Robots that run without end, driven by a mixture of teacher and student."""
+
+    def __init__(
+        self, teacher: FalconLikePolicy, robots: int, threads: int, rng: np.random.Generator
+    ) -> None:
+        self.teacher, self.rng, self.robots = teacher, rng, robots
+        morphology = make_morphology("g1")
+        models = [randomise(build_model(morphology, "planning"), rng) for _ in range(robots)]
+        self.simulation = BatchSimulation(models, morphology.standing_qpos(), threads)
+        self.memory = teacher.initial_memory(robots)
+        self.noise = rng.uniform(0, 1, (robots, 1)) * (rng.uniform(size=(robots, 1)) < 0.6)  # noqa: PLR2004
+        self.excitation: Excitation | None = None
+        self.step = 0
+        self.falls = 0
+
+    def collect(
+        self, student: FalconLikePolicy | None, share: float, steps: int, experience: Experience
+    ) -> None:
+        """Run `steps` steps with the teacher's `share` and add them to `experience`."""
+        simulation = self.simulation
+        for step in range(steps):
+            if self.excitation is None or self.step == EPISODE_STEPS:
+                self.excitation = make_excitation(self.rng, self.robots, EPISODE_STEPS, TRAINING)
+                self.step = 0
+            if step % BLOCK_STEPS == 0:
+                teaches = self.rng.uniform(size=self.robots) < share
+            random = self.excitation
+            simulation.push(random.push[self.step])
+            inputs = (
+                *self._sense(),
+                random.command[self.step],
+                random.arms[self.step],
+                self.memory,
+                random.mode[self.step],
+            )
+            taught = self.teacher.act(*inputs)
+            experience.add(taught.memory[:, NUM_JOINTS:], taught.memory[:, :NUM_JOINTS])
+            targets, self.memory = taught
+            if student is not None and not teaches.all():
+                own = student.act(*inputs)
+                targets = np.where(teaches[:, None], taught.targets, own.targets)
+                self.memory = np.where(teaches[:, None], taught.memory, own.memory)
+            simulation.step(targets, random.hand_force[self.step])
+            down = simulation.fallen()
+            simulation.reset(down)
+            self.memory[down] = np.zeros(MEMORY_SIZE)
+            self.falls += int(down.sum())
+            self.step += 1
+
+    def _sense(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities with some noise."""
+        qpos, qvel = self.simulation.qpos.copy(), self.simulation.qvel.copy()
+        normal = self.rng.standard_normal
+        qpos[:, 7:] += 0.005 * self.noise * normal((self.robots, qpos.shape[1] - 7))
+        qpos[:, 3:7] += 0.005 * self.noise * normal((self.robots, 4))
+        qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+        qvel[:, 3:6] += 0.03 * self.noise * normal((self.robots, 3))
+        qvel[:, 6:] += 0.1 * self.noise * normal((self.robots, qvel.shape[1] - 6))
+        return qpos, qvel
+
+
+def randomise(model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjModel:
+    """Vary friction, masses and gains of a model in place."""
+    model.geom_friction[:, 0] = rng.uniform(0.5, 1.2)
+    scale = rng.uniform(0.95, 1.05, (model.nbody, 1))
+    model.body_mass *= scale[:, 0]
+    model.body_inertia *= scale
+    gain = rng.uniform(0.95, 1.05, model.nu)
+    model.actuator_gainprm[:, 0] *= gain
+    model.actuator_biasprm[:, 1] *= gain
+    return model
+
+
+def train(  # noqa: PLR0913
+    network: Network,
+    experience: Experience,
+    updates: int,
+    rates: tuple[float, float],
+    batch: int,
+    generator: torch.Generator,
+) -> float:
+    """Fit the network; the learning rate falls from `rates[0]` to `rates[1]`. Returns the loss."""
+    spread = experience.actions[: experience.size : 50].float().std(0).clamp(min=0.05)
+    scale = torch.from_numpy(OUTPUT_WEIGHTS).float().sqrt() / spread
+    optimizer = torch.optim.Adam(network.body.parameters(), lr=rates[0])
+    decay = (rates[1] / rates[0]) ** (1 / max(updates, 1))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, decay)
+    total = 0.0
+    for _ in range(updates):
+        observations, actions = experience.draw(batch, generator)
+        error = (network.body(network.standardise(observations)) - actions) * scale
+        loss = nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.5)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        total += loss.item()
+    return total / max(updates, 1)
+
+
+def distill(arguments: argparse.Namespace) -> Network:
+    """Run DAgger and return the trained network."""
+    rng = np.random.default_rng(arguments.seed)
+    torch.manual_seed(arguments.seed)
+    torch.set_num_threads(arguments.threads)
+    generator = torch.Generator().manual_seed(arguments.seed)
+    robots, steps = arguments.robots, arguments.steps
+    experience = Experience(arguments.rounds * robots * steps)
+    collector = Collector(Falcon(arguments.teacher), robots, arguments.threads, rng)
+    network, start = None, time.monotonic()
+    for turn in range(arguments.rounds):
+        share = max(0.0, 1.0 - turn / max(1, 0.3 * arguments.rounds))
+        collector.falls = 0
+        collector.collect(network, share, steps, experience)
+        if network is None:
+            network = Network(tuple(arguments.hidden), experience.observations[: experience.size].float())
+        loss = train(network, experience, arguments.updates, (1e-3, 3e-4), arguments.batch, generator)
+        logger.info(
+            "round %d/%d: teacher share %.2f, falls %d, loss %.5f, %d samples, %.0f s",
+            turn + 1, arguments.rounds, share, collector.falls, loss,
+            experience.size, time.monotonic() - start,
+        )  # fmt: skip
+    collector.simulation.close()
+    best = copy.deepcopy(network)
+    for part, rates in enumerate(((5e-4, 1e-4), (1e-4, 2e-5))):
+        loss = train(best, experience, arguments.final_updates // 2, rates, arguments.batch, generator)
+        logger.info("final part %d: loss %.5f, %.0f s", part + 1, loss, time.monotonic() - start)
+    return best
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(
+        description="Distil FALCON's G1 policy into a smaller network and compare the two.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--teacher", help="FALCON's ONNX file; None: cached or downloaded")
+    parser.add_argument("--seed", type=int, default=0, help="seed of training and comparison")
+    parser.add_argument("--out", type=Path, required=True, help="weights of the student, .npz")
+    parser.add_argument("--report", type=Path, help="comparison, JSON")
+    parser.add_argument("--docs", type=Path, help="Markdown page whose table is to be replaced")
+    parser.add_argument("--evaluate-only", action="store_true", help="compare, do not train")
+    parser.add_argument("--hidden", type=int, nargs="+", default=[384, 192], help="layer widths")
+    parser.add_argument("--rounds", type=int, default=40, help="rounds of DAgger")
+    parser.add_argument("--robots", type=int, default=256, help="robots at once")
+    parser.add_argument("--steps", type=int, default=150, help="policy steps a round [20 ms]")
+    parser.add_argument("--updates", type=int, default=300, help="gradient steps a round")
+    parser.add_argument("--final-updates", type=int, default=8000, help="gradient steps at last")
+    parser.add_argument("--batch", type=int, default=2048, help="samples a gradient step")
+    parser.add_argument("--trials", type=int, default=200, help="sequences of the comparison")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of a sequence [s]")
+    parser.add_argument("--threads", type=int, default=2, help="threads")
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Train, unless told otherwise, and compare."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    arguments = parse_arguments()
+    start = time.monotonic()
+    if not arguments.evaluate_only:
+        save_weights(arguments.out, *distill(arguments).layers())
+        logger.info("wrote %s after %.0f s", arguments.out, time.monotonic() - start)
+    report = compare_policies(
+        Falcon(arguments.teacher),
+        Student(str(arguments.out)),
+        seed=arguments.seed,
+        trials=arguments.trials,
+        seconds=arguments.seconds,
+        threads=arguments.threads,
+    )
+    table = write_table(report)
+    logger.info("%s", table)
+    if arguments.report:
+        arguments.report.write_text(json.dumps(report, indent=2) + "\n")
+    if arguments.docs:
+        replace_table(arguments.docs, table)
+
+
+if __name__ == "__main__":
+    main()

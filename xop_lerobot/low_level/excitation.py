@@ -1,0 +1,163 @@
+"""Random commands, arm motions and pushes, on which G1 policies are trained and compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.low_level.falcon_observation import (
+    ARMS,
+    LOWER_LIMITS,
+    NUM_ARM_JOINTS,
+    NUM_COMMANDS,
+    UPPER_LIMITS,
+)
+from xop_lerobot.low_level.policy import POLICY_DT
+
+HEIGHT_NEUTRAL = 0.75
+VELOCITIES = slice(4, 7)
+
+
+@dataclass(frozen=True)
+class ExcitationConfig:
+    """Ranges of the random sequences; the defaults are those of the published comparison.
+
+    Attributes:
+        height: Base height in stance [m].
+        waist_yaw: Largest waist yaw [rad].
+        waist_roll: Largest waist roll [rad].
+        waist_pitch: Waist pitch [rad].
+        vx: Largest forward velocity [m/s].
+        vy: Largest lateral velocity [m/s].
+        yaw_rate: Largest yaw rate [rad/s].
+        arm_range: Part of each arm joint's range that is used, about its middle.
+        arm_speed: Largest speed of the arm targets [rad/s].
+        push: Largest change of the base's planar velocity by a push [m/s].
+        push_period: Mean time between pushes [s].
+        hand_force: Largest force on each hand and axis [N].
+    """
+
+    height: tuple[float, float] = (0.5, 0.75)
+    waist_yaw: float = 0.8
+    waist_roll: float = 0.0
+    waist_pitch: tuple[float, float] = (0.0, 0.0)
+    vx: float = 0.6
+    vy: float = 0.4
+    yaw_rate: float = 0.6
+    arm_range: float = 0.8
+    arm_speed: float = 1.5
+    push: float = 0.5
+    push_period: float = 5.0
+    hand_force: float = 0.0
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Random inputs of `n` robots over `steps` policy steps.
+
+    Attributes:
+        command: Commands. Shape (steps, n, 7).
+        mode: Modes. Shape (steps, n).
+        arms: Arm targets [rad]. Shape (steps, n, 14).
+        push: Sudden change of the base's planar velocity, world [m/s]. Shape (steps, n, 2).
+        hand_force: Force on the left and right hand, world [N]. Shape (steps, n, 2, 3).
+    """
+
+    command: np.ndarray
+    mode: np.ndarray
+    arms: np.ndarray
+    push: np.ndarray
+    hand_force: np.ndarray
+
+
+def make_excitation(
+    rng: np.random.Generator, n: int, steps: int, config: ExcitationConfig
+) -> Excitation:
+    """Draw random sequences: targets held for some seconds, reached by steps or ramps.
+
+    Args:
+        rng: Source of chance.
+        n: Number of robots.
+        steps: Policy steps of 20 ms.
+        config: Ranges.
+    """
+    mode = (_hold(rng, n, steps, (2.0, 7.0))[..., 0] < 0.5).astype(int)  # noqa: PLR2004
+    low = np.array([config.height[0], -config.waist_yaw, -config.waist_roll])
+    low = np.concatenate([low, config.waist_pitch[:1], [-config.vx, -config.vy, -config.yaw_rate]])
+    high = np.array([config.height[1], config.waist_yaw, config.waist_roll])
+    high = np.concatenate([high, config.waist_pitch[1:], [config.vx, config.vy, config.yaw_rate]])
+    neutral = np.array([HEIGHT_NEUTRAL, 0, 0, 0, 0, 0, 0])
+    neutral[0] = min(neutral[0], config.height[1])
+    target = low + (high - low) * _hold(rng, n, steps, (1.0, 5.0), NUM_COMMANDS)
+    keep = _hold(rng, n, steps, (1.0, 5.0), NUM_COMMANDS) < 0.6  # noqa: PLR2004
+    target = np.where(keep, target, neutral)
+    target[..., VELOCITIES] *= (mode == Mode.MOBILE)[..., None]
+    slow = np.array([0.05, 0.3, 0.2, 0.2, 0.5, 0.5, 0.5])
+    fast = np.array([0.5, 3.0, 1.0, 1.0, 5.0, 5.0, 5.0])
+    rate = slow * (fast / slow) ** _hold(rng, n, steps, (1.0, 5.0), NUM_COMMANDS)
+    command = _follow(target, rate, np.tile(neutral, (n, 1)))
+    arms = _make_arms(rng, n, steps, config)
+    push = _make_pushes(rng, n, steps, config)
+    force = config.hand_force * (2 * _hold(rng, n, steps, (1.0, 4.0), 6) - 1)
+    force *= _hold(rng, n, steps, (2.0, 6.0)) < 0.5  # noqa: PLR2004
+    return Excitation(command, mode, arms, push, force.reshape(steps, n, 2, 3))
+
+
+def _hold(
+    rng: np.random.Generator, n: int, steps: int, seconds: tuple[float, float], size: int = 1
+) -> np.ndarray:
+    """Uniform numbers in [0, 1), each held for a random time. Shape (steps, n, size)."""
+    values = np.empty((steps, n, size))
+    for robot in range(n):
+        for channel in range(size):
+            start = 0
+            while start < steps:
+                length = max(1, round(rng.uniform(*seconds) / POLICY_DT))
+                values[start : start + length, robot, channel] = rng.uniform()
+                start += length
+    return values
+
+
+def _follow(target: np.ndarray, rate: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Follow `target` with at most `rate` per second, from `start`. Shape (steps, n, k)."""
+    path, now = np.empty_like(target), start
+    for step in range(len(target)):
+        limit = rate[step] * POLICY_DT
+        now = now + np.clip(target[step] - now, -limit, limit)
+        path[step] = now
+    return path
+
+
+def _make_arms(
+    rng: np.random.Generator, n: int, steps: int, config: ExcitationConfig
+) -> np.ndarray:
+    low, high = LOWER_LIMITS[ARMS], UPPER_LIMITS[ARMS]
+    middle, half = (low + high) / 2, (high - low) / 2
+    target = middle + config.arm_range * half * (2 * _hold(rng, n, steps, (1, 4), 14) - 1)
+    # Part of the time both arms rest, or all joints stay within a third of their range.
+    posture = _hold(rng, n, steps, (3.0, 8.0))
+    target = np.where(posture < 0.2, 0.0, np.where(posture < 0.6, target / 3, target))  # noqa: PLR2004
+    rate = config.arm_speed * (0.2 + 0.8 * _hold(rng, n, steps, (1, 4), NUM_ARM_JOINTS))
+    path = _follow(target, rate, np.zeros((n, NUM_ARM_JOINTS)))
+    smooth = np.empty_like(path)
+    now = path[0]
+    for step in range(steps):  # no corners: a first-order lag of 0.1 s
+        now = now + (path[step] - now) * (POLICY_DT / 0.1)
+        smooth[step] = now
+    return smooth
+
+
+def _make_pushes(
+    rng: np.random.Generator, n: int, steps: int, config: ExcitationConfig
+) -> np.ndarray:
+    push = np.zeros((steps, n, 2))
+    if config.push <= 0:
+        return push
+    happens = rng.uniform(size=(steps, n)) < POLICY_DT / config.push_period
+    happens[:50] = False  # the first second is for standing up
+    count = int(happens.sum())
+    angle, size = rng.uniform(-np.pi, np.pi, count), rng.uniform(0, config.push, count)
+    push[happens] = np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
+    return push
