@@ -10,6 +10,7 @@ import numpy as np
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
 from xop_lerobot.morphology.rby1.links import LINKS
+from xop_lerobot.morphology.rby1.mpc import EFFECTS, PIVOT, mpc_config
 
 if TYPE_CHECKING:
     import mujoco
@@ -73,6 +74,9 @@ class RBY1(Morphology):
         for i, angle in enumerate(ARM_READY)
     }
     contact_points = ("left_wheel_center", "right_wheel_center")
+    contact_groups = (("left_wheel_center",), ("right_wheel_center",))
+    effects = EFFECTS
+    pivot = PIVOT
     fall_height = -0.2
     fall_tilt = 0.35
     wheeled = True
@@ -94,6 +98,4 @@ class RBY1(Morphology):
 
     def mpc_config(self, mode: Mode) -> MpcConfig:
         """Parameters of the model predictive controller in `mode`."""
-        from xop_lerobot.morphology.rby1.mpc import mpc_config  # noqa: PLC0415
-
         return mpc_config(mode)

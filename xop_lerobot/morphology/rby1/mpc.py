@@ -1,0 +1,38 @@
+"""Parameters of the model predictive controller for RB-Y1."""
+
+from __future__ import annotations
+
+from xop_lerobot.command import Mode
+from xop_lerobot.morphology.effect import Acts, Effect
+from xop_lerobot.retarget.config import CostWeights, MpcConfig
+
+PIVOT = 0.228
+"""The wheels' axle is this far ahead of the base frame [m]."""
+
+EFFECTS = (
+    Effect(Acts.FORWARD),
+    Effect(Acts.TURN),
+    *(Effect(Acts.JOINT, f"torso_{i}", lag_s=0.1) for i in range(6)),
+)
+
+TORSO_NOISE = {f"torso_{i}": 0.05 for i in range(6)}
+
+CONFIGS = {
+    Mode.STATIONARY: MpcConfig(
+        num_samples=16,
+        horizon=8,
+        noise_std=TORSO_NOISE,
+        weights=CostWeights(orientation=0.2),
+    ),
+    Mode.MOBILE: MpcConfig(
+        num_samples=16,
+        horizon=10,
+        noise_std={"v": 0.2, "yaw_rate": 0.3, **TORSO_NOISE},
+        weights=CostWeights(orientation=0.2),
+    ),
+}
+
+
+def mpc_config(mode: Mode) -> MpcConfig:
+    """Parameters in `mode`."""
+    return CONFIGS[mode]
