@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from threading import Lock
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -73,17 +73,43 @@ class TickRecord:
     finished: bool = False
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """How far the task of a scene is; nothing publishes it where no task runs.
+
+    Attributes:
+        success: Whether the task is accomplished.
+        done: Whether the episode is over, with success or without.
+    """
+
+    success: bool
+    done: bool
+
+
 class Session:
-    """One robot and one teleoperator."""
+    """One robot and one teleoperator.
+
+    Attributes:
+        name: The session's name.
+        state: State that the robot published last.
+        tick: Record of the teleoperator's last tick.
+        outcome: Outcome of the task after the last action, None where no task runs.
+        episode: Index of the episode being recorded; the robot's seed depends on it.
+        reset_count: Number of robot resets so far; a change tells the teleoperator to re-align.
+        configs: Resolved configuration of each part (`robot`, `teleop`), saved with a dataset.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._lock = Lock()
         self._robots: list[RobotInfo] = []
+        self._reset_asked = False
         self.state: RobotState | None = None
         self.tick: TickRecord | None = None
+        self.outcome: Outcome | None = None
+        self.episode = 0
         self.reset_count = 0
-        """Number of robot resets so far; a change tells the teleoperator to re-align."""
+        self.configs: dict[str, Any] = {}
 
     def announce(self, info: RobotInfo) -> None:
         """Add the robot `info` to the session."""
@@ -96,7 +122,23 @@ class Session:
         with self._lock:
             self._robots = [known for known in self._robots if known is not info]
             if not self._robots:
-                self.state = self.tick = None
+                self.state = self.tick = self.outcome = None
+                self.episode, self._reset_asked = 0, False
+
+    def begin_episode(self, index: int) -> None:
+        """Ask the robot to start over as episode `index`, in its next `get_observation`."""
+        self.episode = index
+        self._reset_asked = True
+
+    def take_reset(self) -> bool:
+        """Whether a reset was asked for since the last call; the robot alone calls this."""
+        asked, self._reset_asked = self._reset_asked, False
+        return asked
+
+    def confirm_reset(self) -> None:
+        """Count a reset that the robot has done, and forget what was before it."""
+        self.state = self.tick = self.outcome = None
+        self.reset_count += 1
 
     @property
     def robot(self) -> RobotInfo:

@@ -1,0 +1,41 @@
+"""LeRobot robots `xop_g1` and `xop_rby1`, driven by whole-body commands through a policy.
+
+Importing this package registers the configurations alone. The device classes bring MuJoCo, so
+they are loaded when they are first asked for.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from lerobot_robot_xop.config_xop import (
+    LowLevelConfig,
+    SceneConfig,
+    XopG1Config,
+    XopRby1Config,
+    XopRobotConfig,
+)
+
+if TYPE_CHECKING:
+    from lerobot_robot_xop.xop_robot import XopG1, XopRby1, XopRobot
+
+__all__ = [
+    "LowLevelConfig",
+    "SceneConfig",
+    "XopG1",
+    "XopG1Config",
+    "XopRby1",
+    "XopRby1Config",
+    "XopRobot",
+    "XopRobotConfig",
+]
+
+_DEVICES = ("XopG1", "XopRby1", "XopRobot")
+
+
+def __getattr__(name: str) -> object:
+    if name not in _DEVICES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from lerobot_robot_xop import xop_robot  # noqa: PLC0415  brings MuJoCo
+
+    return getattr(xop_robot, name)

@@ -1,0 +1,110 @@
+"""Configurations of the robots. Loads neither MuJoCo nor anything of LeRobot's own weight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from lerobot.robots.config import RobotConfig
+
+from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.plant.config import NoiseConfig, SimulationConfig
+
+POLICY_HZ = 50
+"""Rate of every low-level policy [Hz]; the control loop's rate divides it."""
+CLOCKS = ("lockstep", "realtime")
+
+
+@dataclass
+class SceneConfig:
+    """What is simulated around the robot, and how its sensors err."""
+
+    scene: str = "empty"  # name of the scene that the robot stands in
+    noise: str = "off"  # sensor noise: off, mild or harsh
+    sensors: NoiseConfig = field(default_factory=NoiseConfig)  # single numbers over the preset's
+    viewer_port: int = 8012  # port of the browser view, where there is no display
+
+
+@dataclass
+class LowLevelConfig:
+    """The policy that turns whole-body commands into motor targets."""
+
+    name: str = "default"  # policy; default is the robot's own
+    path: str | None = None  # the policy's file, where it takes one
+
+
+@dataclass(kw_only=True)
+class XopRobotConfig(RobotConfig):
+    """What all robots of this project have in common."""
+
+    session: str = "default"  # pairs this robot with the teleoperator of the same session
+    fps: int = 25  # rate of the control loop [Hz]; divides 50 and equals --dataset.fps
+    clock: str = "lockstep"  # lockstep: time passes in send_action alone; realtime: wall clock
+    seed: int = 0  # the same seed gives the same episodes, bit for bit, in lockstep
+    cameras: list[str] | str = field(
+        default_factory=lambda: ["head"]
+    )  # [head, scene] or head,scene
+    width: int = 320  # of a picture [pixels]
+    height: int = 240  # of a picture [pixels]
+    viewer: bool = False  # show the running simulation in a window, or in the browser
+    sim: SceneConfig = field(default_factory=SceneConfig)  # scene and sensor noise
+    low_level: LowLevelConfig = field(default_factory=LowLevelConfig)  # low-level policy
+
+    morphology: ClassVar[str]
+    """Name of the robot's morphology."""
+
+    def __post_init__(self) -> None:
+        """Check every value. LeRobot's own check expects camera objects and is left out.
+
+        Raises:
+            BadValue: If a number is out of its range, with the range.
+            UnknownName: If there is no such clock or noise, with the known ones.
+        """
+        if self.fps < 1 or POLICY_HZ % self.fps:
+            divisors = [n for n in range(1, POLICY_HZ + 1) if POLICY_HZ % n == 0]
+            raise BadValue(
+                f"robot.fps must divide the low-level policy's {POLICY_HZ} Hz, got {self.fps}. "
+                f"Use one of {', '.join(map(str, divisors))}"
+            )
+        if self.clock not in CLOCKS:
+            raise UnknownName("robot.clock", self.clock, CLOCKS)
+        if isinstance(self.cameras, str):
+            names = self.cameras.strip("[] ").split(",")
+            self.cameras = [name.strip() for name in names if name.strip()]
+        if len(set(self.cameras)) < len(self.cameras):
+            raise BadValue(f"robot.cameras names a camera twice: {', '.join(self.cameras)}")
+        self.make_simulation_config()
+
+    def make_simulation_config(self) -> SimulationConfig:
+        """Make the configuration of the simulated plant.
+
+        Raises:
+            BadValue: If a size or the seed is out of its range.
+            UnknownName: If there is no such noise, with the known ones.
+        """
+        return SimulationConfig(
+            scene=self.sim.scene,
+            noise=self.sim.noise,
+            sensors=self.sim.sensors,
+            seed=self.seed,
+            width=self.width,
+            height=self.height,
+            viewer=self.viewer,
+            viewer_port=self.sim.viewer_port,
+        )
+
+
+@RobotConfig.register_subclass("xop_g1")
+@dataclass(kw_only=True)
+class XopG1Config(XopRobotConfig):
+    """Unitree G1 with 29 joints."""
+
+    morphology: ClassVar[str] = "g1"
+
+
+@RobotConfig.register_subclass("xop_rby1")
+@dataclass(kw_only=True)
+class XopRby1Config(XopRobotConfig):
+    """Rainbow Robotics RB-Y1 on two wheels."""
+
+    morphology: ClassVar[str] = "rby1"

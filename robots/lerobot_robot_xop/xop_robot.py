@@ -1,0 +1,218 @@
+"""The robots as LeRobot devices: a low-level policy and a plant behind whole-body commands."""
+
+from __future__ import annotations
+
+import dataclasses
+import weakref
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from lerobot.robots.robot import Robot
+
+from lerobot_robot_xop.config_xop import XopG1Config, XopRby1Config, XopRobotConfig
+from xop_lerobot.dataset.body import Body
+from xop_lerobot.errors import NotConnected, UnknownName
+from xop_lerobot.link import RobotInfo, get_session
+from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.scene import build_scene_spec
+
+if TYPE_CHECKING:
+    from xop_lerobot.morphology.morphology import Morphology
+    from xop_lerobot.plant.policy_loop import PolicyLoop, RealtimeLoop
+    from xop_lerobot.plant.simulation import Simulation
+
+
+class XopRobot(Robot):
+    """A robot that takes whole-body commands; the robots differ in their morphology alone.
+
+    In lock-step, time passes in `send_action` alone, by exactly 1/fps. At the beginning of each
+    episode that is recorded, the next `get_observation` puts the robot back to its start, with a
+    seed made of `config.seed` and the episode's index.
+
+    Args:
+        config: The robot's configuration.
+
+    Raises:
+        UnknownName: If there is no such policy for this robot, no such scene or camera.
+        PolicyFileError: If the policy's file is missing or not what it should be.
+    """
+
+    config_class = XopRobotConfig
+    name = "xop_robot"
+
+    def __init__(self, config: XopRobotConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self.morphology = make_morphology(config.morphology)
+        _check_cameras(self.morphology, config)
+        policy_name = resolve_policy(self.morphology, config.low_level.name)
+        self._policy = make_policy(policy_name, config.low_level.path)
+        self._body = Body(self.morphology)
+        self._session = get_session(config.session)
+        self._plant: Simulation | None = None
+        self._loop: PolicyLoop | RealtimeLoop | None = None
+        self._info = RobotInfo(
+            name=self.name,
+            morphology=self.morphology,
+            low_level=policy_name,
+            low_level_path=config.low_level.path,
+            scene=config.sim.scene,
+            fps=config.fps,
+            seed=config.seed,
+            realtime=config.clock == "realtime",
+        )
+        self.cameras = dict.fromkeys(config.cameras)
+        # The teleoperator must know the robot before either is connected.
+        self._announce()
+        weakref.finalize(self, self._session.withdraw, self._info)
+
+    def _announce(self) -> None:
+        self._session.announce(self._info)
+        self._session.configs["robot"] = {
+            "type": self.name,
+            **dataclasses.asdict(self.config),
+        }
+
+    @cached_property
+    def observation_features(self) -> dict[str, type | tuple[int, int, int]]:
+        """Proprioception as floats, then a picture of each camera (height, width, 3)."""
+        size = (self.config.height, self.config.width, 3)
+        return {**dict.fromkeys(self._body.state_keys, float), **dict.fromkeys(self.cameras, size)}
+
+    @cached_property
+    def action_features(self) -> dict[str, type]:
+        """Whole-body command, mode, arm joints and grippers, all floats."""
+        return dict.fromkeys(self.morphology.layout.keys, float)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the robot stands and takes actions."""
+        return self._loop is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """True: there is nothing to calibrate."""
+        return True
+
+    def calibrate(self) -> None:
+        """Do nothing."""
+
+    def configure(self) -> None:
+        """Do nothing."""
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Put the robot on its feet and let its policy settle it for a second."""
+        del calibrate
+        if self.is_connected:
+            return
+        from xop_lerobot.plant.policy_loop import PolicyLoop, RealtimeLoop  # noqa: PLC0415
+        from xop_lerobot.plant.simulation import Simulation  # noqa: PLC0415
+
+        self._plant = Simulation(self.morphology, self.config.make_simulation_config())
+        loop_class = RealtimeLoop if self._info.realtime else PolicyLoop
+        self._loop = loop_class(self.morphology, self._plant, self._policy)
+        self._announce()
+        self._session.take_reset()
+        self._start_episode()
+
+    def _start_episode(self) -> None:
+        loop = self._connected_loop
+        entropy = np.random.SeedSequence([self.config.seed, self._session.episode])
+        loop.reset(int(entropy.generate_state(1)[0]))
+        self._last_action = self.morphology.rest_action()
+        self._session.confirm_reset()
+
+    @property
+    def _connected_loop(self) -> PolicyLoop | RealtimeLoop:
+        if self._loop is None:
+            raise NotConnected(type(self).__name__)
+        return self._loop
+
+    def get_observation(self) -> dict[str, Any]:
+        """Measure the robot, publish its state in the session, and take the pictures.
+
+        Raises:
+            NotConnected: Before `connect()`.
+        """
+        loop = self._connected_loop
+        if self._session.take_reset():
+            self._start_episode()
+        state = loop.state
+        self._session.state = state
+        assert self._plant is not None
+        pictures = {camera: self._plant.render(camera) for camera in self.cameras}
+        return {**self._body.compute_proprioception(state), **pictures}
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, float]:
+        """Execute `action` for one control period.
+
+        What `action` leaves out stays as it was. Keys of `observation.state` that are no action
+        are passed over: LeRobot sends them when it moves a robot back to where it started.
+
+        Returns:
+            What the robot really executes, limits applied, for every action key.
+
+        Raises:
+            NotConnected: Before `connect()`.
+            UnknownName: If a key is neither of an action nor of an observation.
+            BadValue: If a value is not finite.
+        """
+        loop = self._connected_loop
+        layout = self.morphology.layout
+        sensed = set(self._body.state_keys) - set(layout.keys)
+        known = {key: value for key, value in action.items() if key not in sensed}
+        wanted = layout.from_dict(known, self._last_action)
+        self._last_action = loop.execute(wanted, 1 / self.config.fps)
+        return layout.to_dict(self._last_action)
+
+    def disconnect(self) -> None:
+        """Stop the robot and leave the session; may be called twice."""
+        loop, plant = self._loop, self._plant
+        self._loop = self._plant = None
+        if loop is not None:
+            loop.close()
+        if plant is not None:
+            plant.close()
+        self._session.withdraw(self._info)
+
+
+def resolve_policy(morphology: Morphology, name: str) -> str:
+    """Return the low-level policy that `name` means for this robot.
+
+    Raises:
+        UnknownName: If it does not fit the robot, with those that do.
+    """
+    if name in morphology.policies:
+        return name
+    if name == "default":
+        return morphology.policies[0]
+    raise UnknownName(f"low-level policy of {morphology.name}", name, morphology.policies)
+
+
+def _check_cameras(morphology: Morphology, config: XopRobotConfig) -> None:
+    """Check scene and cameras, before anything is simulated.
+
+    Raises:
+        UnknownName: If there is no such scene or camera, with the known ones.
+    """
+    spec = build_scene_spec(morphology, "full", config.sim.scene)
+    known = [camera.name for camera in spec.cameras]
+    for camera in config.cameras:
+        if camera not in known:
+            raise UnknownName(f"camera of {morphology.name}", camera, known)
+
+
+class XopG1(XopRobot):
+    """Unitree G1."""
+
+    config_class = XopG1Config
+    name = "xop_g1"
+
+
+class XopRby1(XopRobot):
+    """Rainbow Robotics RB-Y1."""
+
+    config_class = XopRby1Config
+    name = "xop_rby1"

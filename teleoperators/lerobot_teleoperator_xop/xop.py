@@ -1,0 +1,150 @@
+"""The teleoperator as a LeRobot device."""
+
+from __future__ import annotations
+
+import dataclasses
+import weakref
+from typing import TYPE_CHECKING, Any
+
+from lerobot.teleoperators.teleoperator import Teleoperator
+
+from lerobot_teleoperator_xop.config_xop import XopConfig
+from xop_lerobot.dataset.host import Host
+from xop_lerobot.errors import LinkError, NotConnected
+from xop_lerobot.link import RobotInfo, get_session
+from xop_lerobot.operator.devices import make_device
+
+if TYPE_CHECKING:
+    from xop_lerobot.teleoperation import Teleoperation
+
+
+class Xop(Teleoperator):
+    """XR device, alignment and retargeter of one robot, which it finds through its session.
+
+    While it exists, LeRobot's record and rollout loops write `XopDataset`s of its robot.
+
+    Args:
+        config: The teleoperator's configuration.
+
+    Raises:
+        UnknownName: If there is no such device.
+        BadValue: If a setting of the device is out of its range or missing.
+    """
+
+    config_class = XopConfig
+    name = "xop"
+
+    def __init__(self, config: XopConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self._session = get_session(config.session)
+        self._teleoperation: Teleoperation | None = None
+        self._is_connected = False
+        self._resets_seen = 0
+        # Refuses a bad device here, before a robot or a dataset exists.
+        device = make_device(config.device)
+        self._session.configs["teleop"] = {"type": self.name, **dataclasses.asdict(config)}
+        self.host = Host(
+            config.session,
+            extra_columns=config.record.columns,
+            has_person=not device.self_engaging,
+        )
+        self.host.install()
+        weakref.finalize(self, self.host.remove)
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        """Action keys of the session's robot; empty while no robot has been made."""
+        try:
+            info = self._session.robot
+        except LinkError:
+            return {}
+        return dict.fromkeys(info.morphology.layout.keys, float)
+
+    @property
+    def feedback_features(self) -> dict[str, type]:
+        """Nothing: the robot's state comes through the session."""
+        return {}
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the device is open."""
+        return self._is_connected
+
+    @property
+    def is_calibrated(self) -> bool:
+        """True: there is nothing to calibrate."""
+        return True
+
+    def calibrate(self) -> None:
+        """Do nothing."""
+
+    def configure(self) -> None:
+        """Do nothing."""
+
+    def connect(self, calibrate: bool = True) -> None:
+        """Open the device; a recording is read and checked here.
+
+        A robot that exists already is taken up at once, otherwise in the first `get_action`.
+
+        Raises:
+            LinkError: If there are two robots in the session.
+            BadRecording: If a recording is missing or malformed.
+        """
+        del calibrate
+        if self._is_connected:
+            return
+        if self.action_features:
+            self._teleoperation = self._make_teleoperation(self._session.robot)
+        else:
+            device = make_device(self.config.device)
+            device.connect()
+            device.disconnect()
+        self._is_connected = True
+
+    def _make_teleoperation(self, info: RobotInfo) -> Teleoperation:
+        from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig  # noqa: PLC0415
+
+        config = TeleoperationConfig(
+            device=self.config.device,
+            alignment=self.config.alignment,
+            retargeter=self.config.retargeter,
+        )
+        teleoperation = Teleoperation(config, info)
+        teleoperation.connect()
+        self._resets_seen = self._session.reset_count
+        return teleoperation
+
+    def get_action(self) -> dict[str, float]:
+        """Turn the robot's newest state and the operator's newest frame into an action.
+
+        Raises:
+            NotConnected: Before `connect()`.
+            LinkError: If the session has no robot, or two, or its robot was never observed.
+        """
+        if not self._is_connected:
+            raise NotConnected(type(self).__name__)
+        info, state = self._session.robot, self._session.state
+        if state is None:
+            raise LinkError(
+                f"{info.name} in session '{self._session.name}' has published no state yet. "
+                "Call its get_observation() before get_action()."
+            )
+        if self._teleoperation is None:
+            self._teleoperation = self._make_teleoperation(info)
+        if self._session.reset_count != self._resets_seen:
+            self._resets_seen = self._session.reset_count
+            self._teleoperation.reset()
+        action, self._session.tick = self._teleoperation.step(state)
+        return info.morphology.layout.to_dict(action)
+
+    def send_feedback(self, feedback: dict[str, Any]) -> None:
+        """Do nothing: the robot's state comes through the session."""
+
+    def disconnect(self) -> None:
+        """Close the device and leave LeRobot as it was; may be called twice."""
+        if self._teleoperation is not None:
+            self._teleoperation.disconnect()
+            self._teleoperation = None
+        self._is_connected = False
+        self.host.remove()

@@ -1,0 +1,119 @@
+"""The columns that an episode holds beside LeRobot's own: operator, goal, retargeter, robot, time.
+
+No key begins with `observation` or `action`, so no policy is trained on them by accident. Every
+column is one-dimensional, and none ever holds NaN, which would break the statistics: what is not
+known is 0, and a flag says so (`operator.engaged`, `operator.tracked`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from xop_lerobot.dataset.body import Body
+from xop_lerobot.link import Outcome, RobotInfo, TickRecord
+from xop_lerobot.state import FRAMES, RobotState
+
+POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
+COST_NAMES = ("tracking", "stance", "collision", "control", "terminal", "fall", "total")
+"""Terms of `retargeter.cost`; a term that a retargeter does not have is 0."""
+HEALTH_NAMES = ("solve_time", "plan_age", "effective_samples", "sync_residual")
+"""Entries of `retargeter.health`: [s], [s], [1], [m]."""
+OWN_PREFIXES = ("operator.", "goal.", "retargeter.", "robot.", "time.", "next.")
+"""What the keys of these columns begin with."""
+
+
+def is_own_column(key: str) -> bool:
+    """Whether `key` is one of this module's columns and not one of LeRobot's."""
+    return key.startswith(OWN_PREFIXES)
+
+
+class Columns:
+    """The extra columns of one robot.
+
+    Args:
+        info: The robot.
+
+    Attributes:
+        features: LeRobot feature of each column: dtype, shape and names.
+    """
+
+    def __init__(self, info: RobotInfo) -> None:
+        morphology = info.morphology
+        self._frames = tuple(morphology.frames)
+        self._body = Body(morphology)
+        effort = self._body.actuator_names
+        self.features: dict[str, dict] = {
+            **{f"operator.{frame}": _feature("float32", POSE_NAMES) for frame in FRAMES},
+            "operator.pinch": _feature("float32", ("left", "right")),
+            "operator.tracked": _feature("bool", FRAMES),
+            "operator.engaged": _feature("bool", ("engaged",)),
+            **{f"goal.{frame}": _feature("float32", POSE_NAMES) for frame in self._frames},
+            "retargeter.command": _feature("float32", morphology.command_space.names),
+            "retargeter.cost": _feature("float32", COST_NAMES),
+            "retargeter.health": _feature("float32", HEALTH_NAMES),
+            "robot.base_pose": _feature("float32", POSE_NAMES),
+            **{f"robot.{frame}": _feature("float32", POSE_NAMES) for frame in self._frames},
+            "robot.effort": _feature("float32", effort),
+            "time.sim": _feature("float64", ("s",)),
+            # Whole nanoseconds: a float32 tensor, which is how LeRobot loads any float, resolves
+            # the seconds since 1970 to two minutes.
+            "time.wall": _feature("int64", ("ns",)),
+            "next.success": _feature("bool", ("success",)),
+            "next.done": _feature("bool", ("done",)),
+        }
+
+    def build_row(
+        self, state: RobotState, tick: TickRecord | None, outcome: Outcome | None
+    ) -> dict[str, np.ndarray]:
+        """Build the columns of one frame.
+
+        Args:
+            state: State at the beginning of the tick.
+            tick: What the teleoperator did in it, None when something else drove the robot.
+            outcome: Outcome of the task after the tick, None where no task runs.
+
+        Returns:
+            An array for every feature, of its very dtype and shape.
+        """
+        frame = tick.frame if tick else None
+        goals = tick.goal.poses if tick and tick.goal else {}
+        done = (outcome is not None and outcome.done) or (tick is not None and tick.finished)
+        values: dict[str, object] = {
+            "operator.engaged": tick is not None and tick.engaged,
+            "retargeter.cost": _pick(COST_NAMES, tick.cost if tick else {}),
+            "retargeter.health": _pick(HEALTH_NAMES, tick.health if tick else {}),
+            "robot.effort": state.effort,
+            "time.sim": state.time,
+            "time.wall": round(state.wall_time * 1e9),
+            "next.success": outcome is not None and outcome.success,
+            "next.done": done,
+        }
+        if frame is not None:
+            values |= {f"operator.{name}": frame.pose(name) for name in FRAMES}
+            values |= {"operator.pinch": frame.pinch, "operator.tracked": frame.tracked}
+        if tick is not None:
+            values["retargeter.command"] = tick.command
+        values |= {f"goal.{name}": pose for name, pose in goals.items()}
+        poses = self._body.compute_poses(state.true_qpos)
+        values |= {f"robot.{name}": pose for name, pose in poses.items()}
+        return {key: _cast(values.get(key), spec) for key, spec in self.features.items()}
+
+
+def _feature(dtype: str, names: Iterable[str]) -> dict:
+    names = list(names)
+    return {"dtype": dtype, "shape": (len(names),), "names": names}
+
+
+def _pick(names: tuple[str, ...], values: Mapping[str, float]) -> list[float]:
+    return [float(values.get(name, 0.0)) for name in names]
+
+
+def _cast(value: object, feature: dict) -> np.ndarray:
+    if value is None:
+        return np.zeros(feature["shape"], feature["dtype"])
+    column = np.reshape(np.asarray(value), feature["shape"])
+    if column.dtype.kind == "f":
+        column = np.nan_to_num(column, nan=0.0, posinf=0.0, neginf=0.0)
+    return column.astype(feature["dtype"])

@@ -1,0 +1,134 @@
+"""Facts on each episode and on the session, kept beside the frames.
+
+They are written twice: as `xop/*` columns of LeRobot's episode metadata, and as one JSON object a
+line in `meta/xop/episodes.jsonl`, because some LeRobot tools drop columns that they do not know.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+FACTS_DIR = Path("meta") / "xop"
+EPISODES_FILE = FACTS_DIR / "episodes.jsonl"
+CONFIG_FILE = FACTS_DIR / "config.json"
+FACTS_PREFIX = "xop/"
+_PACKAGES = ("lerobot_teleoperator_xop", "lerobot", "mujoco", "mink", "numpy", "onnxruntime")
+
+
+@dataclass(frozen=True)
+class EpisodeFacts:
+    """What is known of one episode as a whole.
+
+    Attributes:
+        success: Whether the task was accomplished; False where no task ran.
+        fallen: Whether the robot fell.
+        collision: Whether the robot touched anything but the ground.
+        finished: Whether the operator's recording or script had played out.
+        seed: Seed of the session.
+        task: The task in words.
+        robot: LeRobot's robot type.
+        scene: Scene of the simulation.
+        low_level: Low-level policy.
+        clock: `lockstep` or `realtime`.
+        config_hash: SHA-256 over the resolved configuration, `meta/xop/config.json`.
+        versions: Versions of the packages that decide the data, as JSON.
+        start_time: Host clock at the first frame [s since the epoch].
+        real_fps: Frames per second of the host clock; in real time it should be the dataset's.
+        dropped_frames: Video frames that the encoder dropped; the pictures after one are shifted.
+        late: Whether a real-time episode ran at less than 95 % of its rate.
+    """
+
+    success: bool
+    fallen: bool
+    collision: bool
+    finished: bool
+    seed: int
+    task: str
+    robot: str
+    scene: str
+    low_level: str
+    clock: str
+    config_hash: str
+    versions: str
+    start_time: float
+    real_fps: float
+    dropped_frames: int
+    late: bool
+
+    def to_metadata(self) -> dict[str, Any]:
+        """Return the facts as columns of LeRobot's episode metadata."""
+        return {f"{FACTS_PREFIX}{key}": value for key, value in dataclasses.asdict(self).items()}
+
+
+def append_facts(root: Path, episode: int, length: int, facts: EpisodeFacts) -> None:
+    """Add the line of `episode`, which has `length` frames, and see it on the disk."""
+    row = {"episode_index": episode, "length": length, **dataclasses.asdict(facts)}
+    row["versions"] = json.loads(facts.versions)
+    path = root / EPISODES_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_facts(root: Path) -> list[dict[str, Any]]:
+    """Read `meta/xop/episodes.jsonl`; a line that a crash cut off is left out."""
+    path = root / EPISODES_FILE
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return rows
+
+
+def write_config(root: Path, config: Mapping[str, Any]) -> None:
+    """Write the resolved configuration of a session to `meta/xop/config.json`."""
+    path = root / CONFIG_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(to_plain(config), indent=2) + "\n", encoding="utf-8")
+
+
+def compute_config_hash(config: Mapping[str, Any]) -> str:
+    """Compute the SHA-256 of a configuration, the same for the same values in any order."""
+    text = json.dumps(to_plain(config), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def to_plain(value: Any) -> Any:  # noqa: ANN401  any configuration value
+    """Turn dataclasses, paths, enums and tuples into what JSON knows."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {
+            field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {str(key): to_plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_plain(item) for item in value]
+    if isinstance(value, Enum):
+        return value.name
+    return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
+
+
+@cache
+def read_versions() -> str:
+    """Versions of the packages that decide what is recorded, as one JSON object."""
+    versions = {}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return json.dumps(versions)

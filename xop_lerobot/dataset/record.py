@@ -1,0 +1,257 @@
+"""`xop-record`: the flags of `lerobot-record`, and this project's dataset without any detour.
+
+What it adds: an episode ends on success, lock-step runs as fast as the machine allows, and Ctrl-C
+ends without a traceback. Example:
+
+    xop-record --robot.type=xop_g1 --teleop.type=xop --teleop.device.type=scripted \
+        --dataset.repo_id=local/walk --dataset.root=outputs/walk --dataset.fps=25 \
+        --dataset.num_episodes=2 --dataset.episode_time_s=20 --dataset.single_task=walk \
+        --dataset.push_to_hub=false
+"""
+# No `from __future__ import annotations` here: LeRobot's parser reads the annotation of `record`.
+
+import logging
+import sys
+import time
+from collections.abc import MutableMapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from lerobot.configs import parser
+from lerobot.datasets import (
+    VideoEncodingManager,
+    aggregate_pipeline_dataset_features,
+    create_initial_features,
+)
+from lerobot.processor import make_default_processors
+from lerobot.robots import Robot, make_robot_from_config
+from lerobot.scripts.lerobot_record import RecordConfig
+from lerobot.teleoperators import Teleoperator, make_teleoperator_from_config
+from lerobot.utils.constants import ACTION, OBS_STR
+from lerobot.utils.feature_utils import build_dataset_frame, combine_feature_dicts
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.keyboard_input import init_keyboard_listener
+from lerobot.utils.robot_utils import precise_sleep
+from lerobot.utils.utils import init_logging, log_say
+from lerobot.utils.visualization_utils import (
+    init_visualization,
+    log_visualization_data,
+    shutdown_visualization,
+)
+
+from xop_lerobot.dataset.host import count_ticks
+from xop_lerobot.dataset.shutdown import TermAsInterrupt
+from xop_lerobot.dataset.xop_dataset import XopDataset
+from xop_lerobot.errors import BadValue, XopError
+
+if TYPE_CHECKING:
+    from lerobot_teleoperator_xop.config_xop import XopConfig
+
+logger = logging.getLogger(__name__)
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C or SIGTERM."""
+
+
+@dataclass
+class XopRecordConfig(RecordConfig):
+    """The flags of `lerobot-record`, and these."""
+
+    # End an episode as soon as its task is accomplished
+    stop_on_success: bool = True
+    # Slow a lock-step simulation down to real time, to watch it or to drive it by hand
+    pace: bool = False
+
+
+@dataclass
+class Recording:
+    """What one episode after another is recorded with.
+
+    Attributes:
+        config: Flags.
+        robot: Connected robot.
+        teleop: Connected teleoperator.
+        dataset: Dataset to add to.
+        events: Keyboard events: `exit_early`, `rerecord_episode`, `stop_recording`.
+    """
+
+    config: XopRecordConfig
+    robot: Robot
+    teleop: Teleoperator
+    dataset: XopDataset
+    events: MutableMapping[str, bool] = field(default_factory=dict)
+    realtime: bool = False
+
+    def run(self) -> None:
+        """Record the episodes that `config` asks for."""
+        recorded = 0
+        while recorded < self.config.dataset.num_episodes and not self.events["stop_recording"]:
+            log_say(f"Recording episode {self.dataset.num_episodes}", self.config.play_sounds)
+            self.run_episode()
+            if self.events["rerecord_episode"]:
+                self.events["rerecord_episode"] = self.events["exit_early"] = False
+                self.dataset.clear_episode_buffer()
+                continue
+            self.dataset.save_episode()
+            recorded += 1
+
+    def run_episode(self) -> None:
+        """Record one episode, until its time, its end, its success or a key."""
+        config = self.config
+        fps, duration = config.dataset.fps, config.dataset.episode_time_s
+        limit = None if self.realtime else count_ticks(duration, fps)
+        self.dataset.begin(self.events, limit, stop_on_success=config.stop_on_success)
+        start = time.perf_counter()
+        while not self.events["exit_early"]:
+            tick_start = time.perf_counter()
+            if self.realtime and tick_start - start >= duration:
+                break
+            self.run_tick()
+            if self.realtime or config.pace:
+                precise_sleep(max(0.0, tick_start + 1 / fps - time.perf_counter()))
+        self.events["exit_early"] = False
+
+    def run_tick(self) -> None:
+        """Observe, decide, act, record."""
+        config, features = self.config, self.dataset.features
+        observation = self.robot.get_observation()
+        action = self.teleop.get_action()
+        self.robot.send_action(action)
+        self.dataset.add_frame(
+            {
+                **build_dataset_frame(features, observation, prefix=OBS_STR),
+                **build_dataset_frame(features, action, prefix=ACTION),
+                "task": config.dataset.single_task,
+            }
+        )
+        if config.display_data:
+            log_visualization_data(
+                config.display_mode,
+                observation=observation,
+                action=action,
+                compress_images=config.display_compressed_images,
+            )
+
+
+@parser.wrap()
+def record(config: XopRecordConfig) -> XopDataset:
+    """Record episodes of an xop robot with an xop teleoperator."""
+    init_logging()
+    robot_config, teleop_config = config.robot, config.teleop
+    check_types(robot_config.type, teleop_config.type if teleop_config else "none")
+    robot = make_robot_from_config(config.robot)
+    teleop: Any = make_teleoperator_from_config(config.teleop)
+    # LeRobot's own loop is not used here, so it needs no help.
+    teleop.host.remove()
+    terminator = TermAsInterrupt()
+    terminator.install()
+    dataset = listener = None
+    try:
+        if config.display_data:
+            init_visualization(
+                config.display_mode,
+                session_name="recording",
+                ip=config.display_ip,
+                port=config.display_port,
+            )
+        dataset = open_dataset(config, robot, robot_config.session, teleop_config)
+        teleop.connect()
+        robot.connect()
+        listener, events = init_keyboard_listener()
+        realtime = robot_config.clock == "realtime"
+        with VideoEncodingManager(dataset):
+            Recording(config, robot, teleop, dataset, events, realtime).run()
+    finally:
+        if dataset is not None:
+            dataset.finalize()
+        robot.disconnect()
+        teleop.disconnect()
+        if listener is not None:
+            listener.stop()
+        if config.display_data:
+            shutdown_visualization(config.display_mode)
+        terminator.remove()
+    if config.dataset.push_to_hub and dataset.num_episodes > 0:
+        dataset.push_to_hub(tags=config.dataset.tags, private=config.dataset.private)
+    return dataset
+
+
+def check_types(robot: str, teleop: str) -> None:
+    """Check that robot and teleoperator are this project's.
+
+    Raises:
+        BadValue: If one isn't; `lerobot-record` takes all of them.
+    """
+    if not robot.startswith("xop_") or teleop != "xop":
+        raise BadValue(
+            "xop-record takes --robot.type=xop_g1 or xop_rby1 and --teleop.type=xop, got "
+            f"{robot} and {teleop}. Use lerobot-record for others"
+        )
+
+
+def open_dataset(
+    config: XopRecordConfig,
+    robot: Robot,
+    session: str,
+    teleop: "XopConfig",
+) -> XopDataset:
+    """Create the dataset that the flags describe, or open it to add to it."""
+    flags = config.dataset
+    bound = XopDataset.bind(session, extra_columns=teleop.record.columns)
+    options = {
+        "root": flags.root,
+        "batch_encoding_size": flags.video_encoding_batch_size,
+        "rgb_encoder": flags.rgb_encoder,
+        "depth_encoder": flags.depth_encoder,
+        "encoder_threads": flags.encoder_threads,
+        "streaming_encoding": flags.streaming_encoding,
+        "encoder_queue_maxsize": flags.encoder_queue_maxsize,
+        "image_writer_processes": flags.num_image_writer_processes,
+        "image_writer_threads": flags.num_image_writer_threads_per_camera * len(robot.cameras),
+    }
+    if config.resume:
+        return bound.resume(flags.repo_id, **options)
+    flags.stamp_repo_id()
+    return bound.create(
+        flags.repo_id,
+        flags.fps,
+        build_features(robot, use_videos=flags.video),
+        robot_type=robot.name,
+        use_videos=flags.video,
+        **options,
+    )
+
+
+def build_features(robot: Robot, *, use_videos: bool) -> dict[str, dict]:
+    """Build LeRobot's own features of a robot: `action`, `observation.state` and the pictures."""
+    teleop_step, _, observation_step = make_default_processors()
+    return combine_feature_dicts(
+        aggregate_pipeline_dataset_features(
+            pipeline=teleop_step,
+            initial_features=create_initial_features(action=robot.action_features),
+            use_videos=use_videos,
+        ),
+        aggregate_pipeline_dataset_features(
+            pipeline=observation_step,
+            initial_features=create_initial_features(observation=robot.observation_features),
+            use_videos=use_videos,
+        ),
+    )
+
+
+def main() -> None:
+    """Run `xop-record`; a mistake of the user's ends in one line and not in a traceback."""
+    import lerobot_teleoperator_xop  # noqa: F401, PLC0415  also where it is not installed
+
+    register_third_party_plugins()
+    try:
+        record()
+    except KeyboardInterrupt:
+        print("stopped; the episodes that were saved stay", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except XopError as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

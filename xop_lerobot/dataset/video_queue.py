@@ -1,0 +1,48 @@
+"""No video frame is lost: wait for the encoder in lock-step, count what it drops in real time.
+
+LeRobot's streaming encoder drops a frame when its queue stays full for 0.1 s. The row stays, so
+every later picture of the episode belongs to another moment. A simulation can wait instead.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import Any
+
+logger = logging.getLogger(__name__)
+
+_POLL_S = 0.001
+
+
+class VideoQueue:
+    """The queues of a streaming encoder, None where frames go to image files.
+
+    Args:
+        encoder: LeRobot's `StreamingVideoEncoder`, or None.
+    """
+
+    def __init__(self, encoder: Any) -> None:  # noqa: ANN401  LeRobot keeps its type private
+        self._encoder = encoder
+        names = ("_frame_queues", "_threads", "_dropped_frames")
+        self._readable = encoder is None or all(hasattr(encoder, name) for name in names)
+        if not self._readable:
+            logger.warning(
+                "LeRobot's video encoder has changed: frames that it drops can be neither "
+                "prevented nor counted. Use --dataset.streaming_encoding=false."
+            )
+
+    def wait(self) -> None:
+        """Wait until every queue takes a frame; a dead encoder is left for LeRobot to report."""
+        if self._encoder is None or not self._readable:
+            return
+        for key, queue in self._encoder._frame_queues.items():
+            while queue.full() and self._encoder._threads[key].is_alive():
+                time.sleep(_POLL_S)
+
+    @property
+    def dropped(self) -> int:
+        """Frames dropped in this episode, over all cameras."""
+        if self._encoder is None or not self._readable:
+            return 0
+        return sum(self._encoder._dropped_frames.values())

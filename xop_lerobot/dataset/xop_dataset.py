@@ -1,0 +1,343 @@
+"""A LeRobot dataset with the columns, episode hooks and durability of this project.
+
+`XopDataset` is `LeRobotDataset` in every respect that LeRobot's loops see: while it records,
+`features` shows LeRobot's own columns alone. What it adds comes from the session in which robot
+and teleoperator meet (`xop_lerobot.link`), so the loops need not know of it.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections.abc import MutableMapping
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import HF_LEROBOT_HOME
+
+from xop_lerobot.dataset import durability
+from xop_lerobot.dataset.columns import Columns, is_own_column
+from xop_lerobot.dataset.facts import (
+    FACTS_PREFIX,
+    EpisodeFacts,
+    append_facts,
+    compute_config_hash,
+    read_versions,
+    write_config,
+)
+from xop_lerobot.dataset.shutdown import hold_signals
+from xop_lerobot.dataset.video_queue import VideoQueue
+from xop_lerobot.errors import XopError
+from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
+
+logger = logging.getLogger(__name__)
+
+_LATE = 0.95
+"""Share of its rate under which a real-time episode is marked as late."""
+
+
+class DatasetExists(XopError, FileExistsError):
+    """The directory of a new dataset is there already."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(
+            f"dataset directory '{root}' exists already. Choose another --dataset.root, delete "
+            "it, or add episodes to it with --resume=true"
+        )
+
+
+class WrongFps(XopError, ValueError):
+    """Robot and dataset run at different rates."""
+
+    def __init__(self, robot_fps: int, dataset_fps: int) -> None:
+        super().__init__(
+            f"the robot runs at {robot_fps} Hz (--robot.fps) and the dataset at {dataset_fps} Hz "
+            f"(--dataset.fps); they must be equal. Use --dataset.fps={robot_fps}"
+        )
+
+
+class _Tally:
+    """What is counted over the frames of one episode."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.start_time = 0.0
+        self.last = self.first = 0.0
+        self.success = self.fallen = self.collision = self.finished = False
+        self.task = ""
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of the host clock, 0 for a single frame."""
+        span = self.last - self.first
+        return (self.frames - 1) / span if span > 0 else 0.0
+
+
+class XopDataset(LeRobotDataset):
+    """LeRobotDataset plus operator, goal, retargeter and robot columns.
+
+    Attributes:
+        session_name: Session whose robot and teleoperator are recorded.
+        extra_columns: Whether to record the columns of `xop_lerobot.dataset.columns`.
+    """
+
+    session_name: ClassVar[str] = "default"
+    extra_columns: ClassVar[bool] = True
+
+    _session: Session
+    _info: RobotInfo
+    _columns: Columns | None
+    _config_hash: str
+    _keep_facts: bool
+    _own_root: bool
+    _create_options: dict[str, Any]
+
+    @classmethod
+    def bind(cls, session: str, *, extra_columns: bool = True) -> type[Self]:
+        """Return this class for the session `session`."""
+        names = {"session_name": session, "extra_columns": extra_columns}
+        return type(cls.__name__, (cls,), {**names, "__doc__": cls.__doc__})
+
+    @classmethod
+    def create(  # pyright: ignore[reportIncompatibleMethodOverride]
+        cls, repo_id: str, fps: int, features: dict, root: str | Path | None = None, **options: Any
+    ) -> Self:
+        """Create a dataset; see `LeRobotDataset.create` for the arguments.
+
+        Raises:
+            LinkError: If the session has no robot, or more than one.
+            WrongFps: If the robot runs at another rate.
+            DatasetExists: If the directory is there already.
+        """
+        info = get_session(cls.session_name).robot
+        if fps != info.fps:
+            raise WrongFps(info.fps, fps)
+        folder = Path(root) if root else HF_LEROBOT_HOME / repo_id
+        if folder.exists():
+            raise DatasetExists(folder)
+        columns = Columns(info) if cls.extra_columns else None
+        features = {**features, **(columns.features if columns else {})}
+        dataset = super().create(repo_id, fps, features, root=root, **options)
+        dataset._begin_session(info, columns, options)
+        dataset._own_root = True
+        return dataset
+
+    @classmethod
+    def resume(  # pyright: ignore[reportIncompatibleMethodOverride]
+        cls, repo_id: str, root: str | Path | None = None, **options: Any
+    ) -> Self:
+        """Add to a dataset; see `LeRobotDataset.resume` for the arguments.
+
+        A dataset that was recorded without this project's columns stays without them.
+
+        Raises:
+            LinkError: If the session has no robot, or more than one.
+            WrongFps: If the robot runs at another rate.
+        """
+        info = get_session(cls.session_name).robot
+        dataset = super().resume(repo_id, root=root, **options)
+        if dataset.fps != info.fps:
+            raise WrongFps(info.fps, dataset.fps)
+        columns = Columns(info)
+        has_columns = all(key in dataset.meta.features for key in columns.features)
+        if not has_columns and cls.extra_columns:
+            logger.warning(
+                "'%s' was recorded without the operator's columns; new episodes have none either.",
+                dataset.root,
+            )
+        dataset._begin_session(info, columns if has_columns else None, options)
+        episodes = dataset.meta.episodes
+        if episodes is not None and len(episodes) > 0:
+            dataset._keep_facts = f"{FACTS_PREFIX}success" in episodes.column_names
+        return dataset
+
+    def _begin_session(
+        self, info: RobotInfo, columns: Columns | None, options: dict[str, Any]
+    ) -> None:
+        self._session = get_session(self.session_name)
+        self._info, self._columns = info, columns
+        self._create_options = options
+        self._keep_facts, self._own_root = True, False
+        self._tally = _Tally()
+        self._tick_limit: int | None = None
+        self._stop_on_success = False
+        self._events: MutableMapping[str, bool] = {}
+        self._config_hash = compute_config_hash(self._session.configs)
+        write_config(self.root, self._session.configs)
+        self._attach_writer()
+        self._session.begin_episode(self.num_episodes)
+
+    def _attach_writer(self) -> None:
+        self._video = VideoQueue(getattr(self.writer, "_streaming_encoder", None))
+        stock = self.meta.save_episode
+
+        def save_with_facts(
+            episode_index: int,
+            episode_length: int,
+            episode_tasks: list[str],
+            episode_stats: dict[str, dict],
+            episode_metadata: dict,
+        ) -> None:
+            """Save an episode's metadata, with what is known of it as a whole."""
+            if self._keep_facts:
+                episode_metadata = {**episode_metadata, **self._collect_facts().to_metadata()}
+            stock(episode_index, episode_length, episode_tasks, episode_stats, episode_metadata)
+
+        # An instance attribute, so that other datasets of the process are untouched.
+        self.meta.save_episode = save_with_facts
+
+    # The episode, as LeRobot's loops drive it.
+
+    @property
+    def features(self) -> dict[str, dict]:
+        """All columns; while recording, only those that LeRobot's loops fill."""
+        features = self.meta.features
+        if self.writer is None or self._is_finalized:
+            return features
+        return {key: value for key, value in features.items() if not is_own_column(key)}
+
+    def begin(
+        self,
+        events: MutableMapping[str, bool],
+        tick_limit: int | None,
+        *,
+        stop_on_success: bool = False,
+    ) -> None:
+        """Say how the episode that begins now ends.
+
+        Args:
+            events: The loop's events; `exit_early` is set when the episode is over.
+            tick_limit: Frames after which it is over, None to leave that to the loop.
+            stop_on_success: Whether it is over as soon as the task is accomplished.
+        """
+        self._events, self._tick_limit = events, tick_limit
+        self._stop_on_success = stop_on_success
+
+    def add_frame(self, frame: dict) -> None:
+        """Add a frame with this tick's extra columns."""
+        session, tally = self._session, self._tally
+        state, outcome = session.state, session.outcome
+        tick = self._current_tick()
+        if self._columns is not None and state is not None:
+            frame = {**frame, **self._columns.build_row(state, tick, outcome)}
+        if not self._info.realtime:
+            self._video.wait()
+        tally.task = str(frame["task"])
+        super().add_frame(frame)
+
+        tally.last = time.perf_counter()
+        if tally.frames == 0:
+            tally.first, tally.start_time = tally.last, time.time()
+        tally.frames += 1
+        if state is not None:
+            tally.fallen |= state.fallen
+            tally.collision |= state.collision
+        tally.success = outcome is not None and outcome.success
+        tally.finished = tick is not None and tick.finished
+        is_over = tally.finished or tally.frames == self._tick_limit
+        if is_over or (self._stop_on_success and tally.success):
+            self._events["exit_early"] = True
+
+    def _current_tick(self) -> TickRecord | None:
+        """The teleoperator's record of this very tick, None if a policy drove the robot."""
+        session = self._session
+        tick, state = session.tick, session.state
+        if tick is None or state is None or tick.state.time != state.time:
+            return None
+        return tick
+
+    def save_episode(
+        self, episode_data: dict | None = None, parallel_encoding: bool = True
+    ) -> None:
+        """Save the episode so that it survives a crash, and ask the robot to start over."""
+        facts, index = self._collect_facts(), self.num_episodes
+        if not self._info.realtime and facts.dropped_frames:
+            raise XopError(
+                f"episode {index} lost {facts.dropped_frames} video frames; it is not saved"
+            )
+        length = self._tally.frames
+        with hold_signals():
+            super().save_episode(episode_data, parallel_encoding)
+            self._own_root = False
+            self._secure()
+            append_facts(self.root, index, length, facts)
+        if facts.dropped_frames or facts.late:
+            logger.warning(
+                "Episode %d dropped %d video frames and ran at %.1f Hz of %d; it is marked so.",
+                index,
+                facts.dropped_frames,
+                facts.real_fps,
+                self.fps,
+            )
+        self._begin_next(index + 1)
+
+    def clear_episode_buffer(self, delete_images: bool = True) -> None:
+        """Discard the episode and ask the robot to start over."""
+        super().clear_episode_buffer(delete_images)
+        self._begin_next(self.num_episodes)
+
+    def finalize(self) -> None:
+        """Close all files; a dataset that never got an episode is removed again."""
+        if self._is_finalized:
+            return
+        super().finalize()
+        durability.forget_rotation(self)
+        if self._own_root and self.num_episodes == 0:
+            shutil.rmtree(self.root, ignore_errors=True)
+
+    def _begin_next(self, index: int) -> None:
+        self._tally = _Tally()
+        self._session.begin_episode(index)
+
+    def _secure(self) -> None:
+        if durability.can_rotate(self):
+            durability.rotate_writers(self)
+            return
+        kept = {name: value for name, value in vars(self).items() if name in _KEPT}
+        LeRobotDataset.finalize(self)
+        names = LeRobotDataset.resume.__func__.__code__.co_varnames  # type: ignore[attr-defined]
+        options = {key: value for key, value in self._create_options.items() if key in names}
+        fresh = super().resume(self.repo_id, root=self.root, **options)
+        self.__dict__.update(vars(fresh) | kept)
+        # `fresh` shares the writer now; it must not close it when it is collected.
+        fresh.writer = None
+        self._attach_writer()
+
+    def _collect_facts(self) -> EpisodeFacts:
+        tally, info = self._tally, self._info
+        return EpisodeFacts(
+            success=tally.success,
+            fallen=tally.fallen,
+            collision=tally.collision,
+            finished=tally.finished,
+            seed=info.seed,
+            task=tally.task,
+            robot=info.name,
+            scene=info.scene,
+            low_level=info.low_level,
+            clock="realtime" if info.realtime else "lockstep",
+            config_hash=self._config_hash,
+            versions=read_versions(),
+            start_time=tally.start_time,
+            real_fps=tally.fps,
+            dropped_frames=self._video.dropped,
+            late=info.realtime and tally.frames > 1 and tally.fps < _LATE * info.fps,
+        )
+
+
+_KEPT = (
+    "_session",
+    "_info",
+    "_columns",
+    "_create_options",
+    "_keep_facts",
+    "_own_root",
+    "_tally",
+    "_tick_limit",
+    "_stop_on_success",
+    "_events",
+    "_config_hash",
+)
+"""Attributes that outlive a change of writer."""
