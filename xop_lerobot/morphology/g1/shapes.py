@@ -14,40 +14,57 @@ MATERIALS = {
 """Red, green, blue, gloss."""
 
 
+ACROSS = (1.5708, 0, 0)
+"""Roll that lays a cylinder along Y [rad]."""
+
 BODY = (
-    Shape("pelvis", "ellipsoid", (0.07, 0.085, 0.065), (0, 0, -0.075), material="grey"),
-    Shape("torso_link", "box", (0.055, 0.09, 0.085), (0.004, 0, 0.195), material="shell"),
-    Shape("torso_link", "box", (0.045, 0.055, 0.055), (0.002, 0, 0.075), material="dark"),
-    Shape(
-        "torso_link", "capsule", (0.062,), ends=(0.008, 0, 0.385, 0.008, 0, 0.425), material="shell"
-    ),
-)
+    Shape("pelvis", "ellipsoid", (0.072, 0.08, 0.062), (0, 0, -0.07), material="shell"),
+    look("pelvis", "cylinder", (0.045, 0.075), "dark", pos=(0, 0, -0.1), rpy=ACROSS),
+    look("waist_yaw_link", "cylinder", (0.048, 0.045), "dark", pos=(0, 0, 0.025)),
+    Shape("torso_link", "box", (0.045, 0.052, 0.065), (0.0, 0, 0.075), material="dark"),
+    Shape("torso_link", "box", (0.055, 0.085, 0.075), (0.002, 0, 0.205), material=None),
+    look("torso_link", "ellipsoid", (0.075, 0.105, 0.1), "shell", pos=(0.004, 0, 0.205)),
+    look("torso_link", "capsule", (0.054,), "shell", ends=(0, -0.062, 0.243, 0, 0.062, 0.243)),
+    look("torso_link", "ellipsoid", (0.066, 0.08, 0.065), "shell", pos=(0.004, 0, 0.14)),
+    look("torso_link", "cylinder", (0.036, 0.035), "dark", pos=(0.0, 0, 0.325)),
+    Shape("torso_link", "capsule", (0.06,), ends=(0.002, 0, 0.385, 0.002, 0, 0.42),
+          material="shell"),
+    look("torso_link", "ellipsoid", (0.042, 0.0535, 0.068), "visor", pos=(0.03, 0, 0.402)),
+    look("torso_link", "ellipsoid", (0.008, 0.03, 0.0035), "light", pos=(0.061, 0, 0.445)),
+)  # fmt: skip
 
 LEFT = (
-    Shape("left_hip_pitch_link", "cylinder", (0.045, 0.03), (0, 0.04, -0.025), (1.5708, 0, 0),
+    Shape("left_hip_pitch_link", "cylinder", (0.048, 0.032), (0, 0.045, -0.025), ACROSS,
           material="dark"),
-    Shape("left_hip_roll_link", "capsule", (0.05,), ends=(0.02, 0, -0.02, 0.02, 0, -0.09),
+    Shape("left_hip_roll_link", "capsule", (0.048,), ends=(0.022, 0, -0.02, 0.022, 0, -0.09),
           material="shell"),
-    Shape("left_hip_yaw_link", "capsule", (0.052,), ends=(-0.02, 0, -0.04, -0.066, 0, -0.15),
+    Shape("left_hip_yaw_link", "capsule", (0.054,), ends=(-0.012, 0, -0.02, -0.06, 0, -0.13),
           material="shell"),
-    Shape("left_knee_link", "capsule", (0.046,), ends=(0.005, 0, -0.03, 0.008, 0, -0.12),
+    look("left_knee_link", "cylinder", (0.05, 0.046), "dark", pos=(0, 0.002, 0), rpy=ACROSS),
+    Shape("left_knee_link", "capsule", (0.046,), ends=(0.008, 0, -0.045, 0.008, 0, -0.13),
           material="shell"),
-    Shape("left_knee_link", "capsule", (0.032,), ends=(0.006, 0, -0.14, 0, 0, -0.27),
+    Shape("left_knee_link", "capsule", (0.032,), ends=(0.004, 0, -0.16, 0, 0, -0.27),
           material="dark"),
-    Shape("left_shoulder_pitch_link", "cylinder", (0.035, 0.025), (0, 0.035, -0.01),
-          (1.5708, 0, 0), material="dark"),
-    Shape("left_shoulder_roll_link", "capsule", (0.036,), ends=(0, 0.006, -0.02, 0, 0.006, -0.07),
-          material="shell"),
-    Shape("left_shoulder_yaw_link", "capsule", (0.034,), ends=(0.003, 0, -0.01, 0.013, 0, -0.08),
-          material="shell"),
-    Shape("left_elbow_link", "capsule", (0.031,), ends=(0.02, 0, -0.01, 0.08, 0.002, -0.01),
-          material="shell"),
-    Shape("left_wrist_pitch_link", "capsule", (0.027,), ends=(-0.01, 0, 0, 0.035, 0, 0),
+    look("left_ankle_roll_link", "ellipsoid", (0.075, 0.034, 0.03), "grey", pos=(0.03, 0, -0.012)),
+    look("left_shoulder_pitch_link", "ellipsoid", (0.045, 0.036, 0.047), "shell",
+         pos=(0, 0.04, -0.005)),
+    Shape("left_shoulder_pitch_link", "cylinder", (0.035, 0.025), (0, 0.035, -0.01), ACROSS,
           material="dark"),
-    Shape("left_wrist_yaw_link", "box", (0.05, 0.016, 0.035), (0.085, 0.003, 0), material="dark",
+    Shape("left_shoulder_roll_link", "capsule", (0.036,), ends=(0, 0.006, -0.025, 0, 0.006, -0.07),
+          material="dark"),
+    Shape("left_shoulder_yaw_link", "capsule", (0.037,), ends=(0.003, 0, 0.01, 0.011, 0, -0.06),
+          material="shell"),
+    look("left_elbow_link", "cylinder", (0.036, 0.034), "dark", rpy=ACROSS),
+    Shape("left_elbow_link", "capsule", (0.032,), ends=(0.03, 0, -0.01, 0.09, 0.002, -0.01),
+          material="shell"),
+    Shape("left_wrist_pitch_link", "capsule", (0.027,), ends=(-0.015, 0, 0, 0.035, 0, 0),
+          material="dark"),
+    Shape("left_wrist_yaw_link", "box", (0.046, 0.016, 0.034), (0.085, 0.003, 0), material="grey",
           name="left_hand"),
-    Shape("left_wrist_yaw_link", "box", (0.035, 0.014, 0.032), (0.165, -0.002, -0.004),
-          (0, 0, -0.25), material="dark"),
+    Shape("left_wrist_yaw_link", "box", (0.036, 0.012, 0.031), (0.161, -0.006, -0.002),
+          (0, 0, -0.25), material="grey", name="left_fingers"),
+    look("left_wrist_yaw_link", "capsule", (0.011,), "grey",
+         ends=(0.07, -0.008, 0.032, 0.12, -0.03, 0.045)),
 )  # fmt: skip
 
 FEET = tuple(
@@ -109,13 +126,16 @@ HEAD_CAMERA = Frame(
 HEAD_FOVY = 58.0
 """Vertical field of view of the head camera [deg]."""
 
-WRIST_CAMERAS = (
-    Frame("left_wrist", "left_wrist_yaw_link", (-0.02, 0.05, 0.03), (0.9, -0.35, -0.12), (0, 0, 1)),
-    Frame(
-        "right_wrist", "right_wrist_yaw_link", (-0.02, -0.05, 0.03), (0.9, 0.35, -0.12), (0, 0, 1)
-    ),
+WRIST_CAMERAS = tuple(
+    Frame(f"{side}_wrist", f"{side}_wrist_yaw_link", (-0.01, 0, 0.085), (0.88, 0, -0.47))
+    for side in ("left", "right")
 )
-WRIST_FOVY = 75.0
+"""On the thumb's side of the hand, looking along it."""
 
-SCENE_CAMERA = Frame("scene", "pelvis", (1.55, 1.1, 0.35), (-1.55, -1.1, -0.4), (0, 0, 1))
+WRIST_FOVY = 75.0
+"""Vertical field of view of the wrist cameras [deg]."""
+
+SCENE_CAMERA = Frame("scene", "pelvis", (1.5, 1.2, 0.35), (-1.5, -1.2, -0.5))
+"""From the front left, following the pelvis and showing the whole robot."""
 SCENE_FOVY = 45.0
+"""Vertical field of view of the scene camera [deg]."""
