@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
 import threading
-from contextlib import AbstractContextManager, nullcontext
+import weakref
+from contextlib import AbstractContextManager, nullcontext, suppress
 
 import mujoco
 import numpy as np
@@ -45,7 +48,6 @@ class Cameras:
         visual.global_.offheight = max(visual.global_.offheight, height)
         visual.quality.offsamples = 0
         self._threads = threading.local()
-        self._renderers: dict[int, _Renderer] = {}
 
     def check_camera(self, camera: str) -> int:
         """Return the id of `camera`.
@@ -79,17 +81,16 @@ class Cameras:
         if renderer is None:
             renderer = _Renderer(self._model, self.width, self.height)
             self._threads.renderer = renderer
-            self._renderers[threading.get_ident()] = renderer
         with lock or nullcontext():
             renderer.copy_positions(data)
         return renderer.render(index)
 
     def close(self) -> None:
         """Release this thread's renderer; those of other threads go when their threads end."""
-        renderer = self._renderers.pop(threading.get_ident(), None)
+        renderer: _Renderer | None = getattr(self._threads, "renderer", None)
         if renderer is not None:
+            del self._threads.renderer
             renderer.close()
-        self._threads = threading.local()
 
 
 class _Renderer:
@@ -97,8 +98,11 @@ class _Renderer:
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         self._model = model
+        self._gl: GlContext | None = None
         self._data = mujoco.MjData(model)
-        self._gl: GlContext | None = make_gl_context(width, height)
+        self._gl = make_gl_context(width, height)
+        _LIVING.add(self)
+        _close_all_at_exit()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=max(MAX_GEOMS, 2 * model.ngeom))
@@ -146,3 +150,26 @@ class _Renderer:
             self._context.free()
             self._gl.free()
             self._gl = None
+
+    def __del__(self) -> None:
+        """Release the context in the thread that ends with it."""
+        with suppress(Exception):
+            self.close()
+
+
+_LIVING: weakref.WeakSet[_Renderer] = weakref.WeakSet()
+
+
+@functools.cache
+def _close_all_at_exit() -> None:
+    """Release what is left before the OpenGL library's own end, which would take it along.
+
+    Called once a context exists: exit handlers run last registered first.
+    """
+    atexit.register(_close_all)
+
+
+def _close_all() -> None:
+    for renderer in list(_LIVING):
+        with suppress(Exception):  # one may be bound to a thread that still runs
+            renderer.close()

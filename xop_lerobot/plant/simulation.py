@@ -345,6 +345,9 @@ def _compute_robot_size(model: mujoco.MjModel, robot_bodies: np.ndarray) -> tupl
 
 
 def _log_mujoco_warnings() -> None:
-    """Send MuJoCo's warnings to the log, where it would write a file into the user's folder."""
+    """Send MuJoCo's warnings to the log, where it would write a file into the user's folder.
+
+    At debug level: a planner's samples may diverge by design; the plant reports its own fault.
+    """
     if mujoco.get_mju_user_warning() is None:
-        mujoco.set_mju_user_warning(lambda text: logger.warning("MuJoCo: %s", text))
+        mujoco.set_mju_user_warning(lambda text: logger.debug("MuJoCo: %s", text))
