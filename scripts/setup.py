@@ -133,20 +133,24 @@ def install_system_packages(gl: bool, compiler: bool) -> None:
     Raises:
         SetupError: If it may not be installed, or the package manager fails; carries the command.
     """
-    missing = " and ".join(
+    names = [
         name
         for name, lacking in (("software rendering (Mesa's EGL)", gl), ("a C compiler", compiler))
         if lacking
-    )
+    ]
+    missing = " and ".join(names)
+    verb = "is" if len(names) == 1 else "are"
     manager = find_manager()
     if manager is None:
-        raise SetupError(f"{missing} is missing. Install it with the system's package manager.")
+        raise SetupError(f"{missing} {verb} missing. Install with the system's package manager.")
     packages = list_system_packages(manager, gl, compiler)
     command = (*INSTALL_COMMANDS[manager], *packages)
     by_hand = f"sudo {' '.join(command)}"
     prefix = find_root_prefix()
     if prefix is None:
-        raise SetupError(f"{missing} is missing and may not be installed here. Run:\n  {by_hand}")
+        raise SetupError(
+            f"{missing} {verb} missing and may not be installed here. Run:\n  {by_hand}"
+        )
     say(f"Installing {missing}: {' '.join(packages)} (XOP_NO_SYSTEM=1 forbids it)")
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     if manager == "apt-get":  # lists may be old or absent; a failing mirror need not matter
