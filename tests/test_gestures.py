@@ -22,6 +22,7 @@ POSE = np.array([0.0, 0, 1.6, 1, 0, 0, 0])
 def run(
     taps: list[tuple[float, float]],
     rate: float = 90,
+    *,
     speed: float = 0.0,
     lost: tuple[float, float] = (9, 9),
     hand: int = 0,
@@ -89,6 +90,8 @@ def test_fast_hand_lost_hand_and_other_hand_do_not_toggle() -> None:
     assert run(DOUBLE, lost=(0.7, 0.9)) == []
     assert run(DOUBLE, lost=(1.2, 1.25)) == []
     assert run(DOUBLE, lost=(1.05, 1.5)) == []
+    assert run(DOUBLE, lost=(1.05, 1.08)) == []  # long before the second press
+    assert run(DOUBLE, lost=(1.35, 1.38)) == []
     assert len(run(DOUBLE, lost=(0.3, 0.7))) == 1
     assert len(run(DOUBLE, lost=(1.6, 3.0))) == 1  # it was complete
     assert run(DOUBLE, hand=1) == []
