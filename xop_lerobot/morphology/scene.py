@@ -104,12 +104,14 @@ def add_sky(spec: mujoco.MjSpec) -> None:
             specular=(0.15,) * 3,
             castshadow=False,
         )
-    spec.visual.headlight.ambient = (0.38,) * 3
+    spec.visual.headlight.ambient = (0.45,) * 3
     spec.visual.headlight.diffuse = (0.22,) * 3
     spec.visual.headlight.specular = (0,) * 3
     spec.visual.global_.offwidth, spec.visual.global_.offheight = OFFSCREEN
     spec.visual.quality.offsamples = 0
     spec.visual.quality.shadowsize = 0
+    # Near and far planes are multiples of the extent, which would else grow with the scene.
+    spec.stat.extent = 2
     spec.visual.map.znear = 0.01
     spec.visual.map.zfar = 30
     # Coarser spheres and cylinders: half the triangles, the same picture at 320 × 240.

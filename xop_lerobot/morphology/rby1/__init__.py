@@ -10,7 +10,7 @@ import numpy as np
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
 from xop_lerobot.morphology.rby1.links import LINKS
-from xop_lerobot.morphology.rby1.mpc import EFFECTS, PIVOT, mpc_config
+from xop_lerobot.morphology.rby1.mpc import EFFECTS, PIVOT, SUPPORT, mpc_config
 
 if TYPE_CHECKING:
     import mujoco
@@ -23,8 +23,9 @@ TORSO_READY = tuple(math.radians(angle) for angle in (0, 45, -90, 45, 0, 0))
 ARM_READY = tuple(math.radians(angle) for angle in (0, 5, 0, -120, 0, 45, 0))
 """Left arm angles at the ready pose [rad]; joints 0, 2, 4 and 6 are 0, joint 1 is mirrored."""
 
-TORSO_RATE = 1.5
-"""Largest rate of a torso command [rad/s]; the joints allow 2.09 and 3.14."""
+TORSO_RATES = (0.4, 0.5, 0.8, 0.6, 0.5, 1.2)
+"""Largest rates of the torso commands [rad/s]. The joints allow 2.09 and 3.14, but 57 kg rest on
+torso 1: reversing it at full rate takes more than its 270 N m, and the torso folds."""
 
 BASE_HEIGHT = -0.0006
 """Height of the base frame at rest [m]: wheels and casters sink in by their compliance."""
@@ -40,7 +41,7 @@ def _make_torso_dims() -> tuple[CommandDim, ...]:
     for i, ready in enumerate(TORSO_READY):
         low, high = joints[f"torso_{i}"].limits or (-math.pi, math.pi)
         name = f"torso_{i}"
-        dims.append(CommandDim(name, f"{name}.pos", "rad", low, high, ready, TORSO_RATE))
+        dims.append(CommandDim(name, f"{name}.pos", "rad", low, high, ready, TORSO_RATES[i]))
     return tuple(dims)
 
 
@@ -51,7 +52,7 @@ class RBY1(Morphology):
     name = "rby1"
     command_space = CommandSpace(
         (
-            CommandDim("v", "x.vel", "m/s", -1.0, 1.0, 0.0, 1.5, mobile_only=True),
+            CommandDim("v", "x.vel", "m/s", -1.0, 1.0, 0.0, 1.2, mobile_only=True),
             CommandDim("yaw_rate", "theta.vel", "rad/s", -1.5, 1.5, 0.0, 3.0, mobile_only=True),
             *_make_torso_dims(),
         )
@@ -77,6 +78,7 @@ class RBY1(Morphology):
     contact_groups = (("left_wheel_center",), ("right_wheel_center",))
     effects = EFFECTS
     pivot = PIVOT
+    support = SUPPORT
     fall_height = -0.2
     fall_tilt = 0.35
     wheeled = True

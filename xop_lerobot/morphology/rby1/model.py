@@ -17,27 +17,33 @@ TIMESTEP = 0.005
 """Physics step [s]."""
 
 FULL_TORQUE_ERROR = 0.01
-"""Position error at which a torso or arm servo gives its rated torque [rad]: the stiffness of a
-joint is its effort over this error, so its sag under gravity is at most 0.01 rad."""
+"""Position error at which a torso or arm servo gives its rated torque [rad].
+
+The stiffness of a joint is its effort over this error, so it sags by at most 0.01 rad under any
+weight that it can bear (4 mrad at the ready pose). MuJoCo's own gravity compensation is left
+off: it would push the weight of the torso and the arms against nothing, and the wheels would
+carry but half the robot, which could then lean any way without tipping.
+"""
 
 INERTIA = {
-    "torso_0": 30.0, "torso_1": 28.0, "torso_2": 14.0, "torso_3": 6.0, "torso_4": 6.0,
+    "torso_0": 30.0, "torso_1": 30.0, "torso_2": 16.0, "torso_3": 5.5, "torso_4": 6.0,
     "torso_5": 3.0,
-    "arm_0": 1.0, "arm_1": 0.9, "arm_2": 0.5, "arm_3": 0.5, "arm_4": 0.2, "arm_5": 0.2,
+    "arm_0": 0.8, "arm_1": 0.5, "arm_2": 0.45, "arm_3": 0.4, "arm_4": 0.12, "arm_5": 0.13,
     "arm_6": 0.1,
 }  # fmt: skip
 """Inertia that each joint moves at the ready pose, rotor included [kg m^2]: it sets the damping."""
 
-ARMATURE = {"torso": 1.0, "arm": 0.1, "head": 0.05, "wheel": 0.05, "finger": 0.1}
+ARMATURE = {"torso": 1.0, "arm": 0.1, "head": 0.05, "wheel": 0.2, "finger": 0.1}
 """Reflected rotor inertia by kind of joint [kg m^2], of a finger [kg]; estimates."""
 
 JOINT_DAMPING = 0.5
 """Viscous friction of torso, arms and head [N m s/rad]."""
 
-WHEEL_GAIN = 30.0
-"""Wheel torque per speed error [N m s/rad]: 22 ms to follow a speed."""
+WHEEL_GAIN = 100.0
+"""Wheel torque per speed error [N m s/rad]: in a curve of 0.8 m/s and 0.8 rad/s, where the mass
+behind the axle pulls the robot straight, 2 % of the yaw rate is lost."""
 
-HEAD_GAINS = (50.0, 3.0)
+HEAD_GAINS = (200.0, 7.0)
 """k_p [N m/rad], k_d [N m s/rad]."""
 
 FINGER_GAINS = (1500.0, 60.0)

@@ -44,14 +44,17 @@ BODY = (
           material="shell"),
     look("link_torso_4", "cylinder", (0.075, 0.06), "dark", pos=(-0.015, 0, 0.15)),
     Shape("link_torso_5", "box", (0.095, 0.13, 0.13), (-0.025, 0, -0.01), material=None),
-    look("link_torso_5", "capsule", (0.095,), "shell", ends=(-0.02, -0.09, 0.05, -0.02, 0.09, 0.05)),
+    look("link_torso_5", "capsule", (0.095,), "shell",
+         ends=(-0.02, -0.09, 0.05, -0.02, 0.09, 0.05)),
     look("link_torso_5", "ellipsoid", (0.115, 0.155, 0.17), "shell", pos=(-0.02, 0, -0.03)),
     look("link_torso_5", "ellipsoid", (0.02, 0.05, 0.012), "accent", pos=(0.082, 0, 0.0)),
     look("link_head_0", "cylinder", (0.042, 0.045), "dark", pos=(0, 0, 0.03)),
     look("link_head_1", "sphere", (0.045,), "dark"),
     Shape("link_head_2", "box", (0.035, 0.06, 0.035), (0.045, 0, 0.07), material=None),
-    look("link_head_2", "capsule", (0.05,), "shell", ends=(0.035, -0.055, 0.07, 0.035, 0.055, 0.07)),
-    look("link_head_2", "capsule", (0.034,), "visor", ends=(0.06, -0.052, 0.07, 0.06, 0.052, 0.07)),
+    look("link_head_2", "capsule", (0.05,), "shell",
+         ends=(0.035, -0.055, 0.07, 0.035, 0.055, 0.07)),
+    look("link_head_2", "capsule", (0.034,), "visor",
+         ends=(0.06, -0.052, 0.07, 0.06, 0.052, 0.07)),
 )  # fmt: skip
 
 WHEELS = tuple(
