@@ -27,9 +27,11 @@ class Effect:
         joint: The joint, where it acts on one.
         lag_s: Time constant with which height or joint follow the command [s].
         modes: Modes in which it has an effect at all.
+        effort: How dear the entry is to the kinematic proposal, over the others [1].
     """
 
     acts: Acts
     joint: str = ""
     lag_s: float = 0.15
     modes: tuple[Mode, ...] = (Mode.STATIONARY, Mode.MOBILE)
+    effort: float = 1.0

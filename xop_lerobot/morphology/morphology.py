@@ -71,6 +71,9 @@ class Morphology(ABC):
     """`contact_points` that touch the ground together: a foot, a wheel."""
     pivot: float = 0.0
     """Forward distance from the base's frame to its centre of turning [m]."""
+    support: tuple[tuple[float, float], ...] = ()
+    """Corners (x, y) in the base's frame, counterclockwise, of the area on which a robot that
+    cannot step stands [m]; empty for one whose policy keeps the balance."""
     hull_points: dict[str, float] = {}
     """Sites on the hull of the robot and the radius around each [m], for obstacles."""
 

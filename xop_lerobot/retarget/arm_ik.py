@@ -63,8 +63,9 @@ class ArmIk:
             mink.ConfigurationLimit(model, gain=0.5),
             mink.VelocityLimit(model, dict.fromkeys(joints, max_speed)),
         ]
-        self._lower = model.jnt_range[[model.joint(joint).id for joint in joints], 0]
-        self._upper = model.jnt_range[[model.joint(joint).id for joint in joints], 1]
+        limited = np.flatnonzero(model.jnt_limited)
+        self._limited = model.jnt_qposadr[limited]
+        self._range = model.jnt_range[limited]
         self.failures = 0
         """Number of solves that the quadratic program failed; the arms then stay."""
 
@@ -95,7 +96,9 @@ class ArmIk:
         if not tasks:
             return arms.copy()
         q = qpos.copy()
-        q[self._qpos] = np.clip(arms, self._lower, self._upper)
+        q[self._qpos] = arms
+        # A frozen joint measured beyond its limit would leave the program no solution.
+        q[self._limited] = np.clip(q[self._limited], *self._range.T)
         rest = q.copy()
         rest[self._qpos] = self._rest
         self._posture.set_target(rest)
@@ -116,4 +119,4 @@ class ArmIk:
                 self.failures += 1
                 break
             self._configuration.integrate_inplace(velocity, step)
-        return np.clip(self._configuration.q[self._qpos], self._lower, self._upper)
+        return self._configuration.q[self._qpos]

@@ -24,6 +24,7 @@ class CostWeights:
         control: w_a, squared deviation of the command from its reference, each entry over its
             scale [1].
         terminal: w_f, factor on the tracking cost at the end of the horizon [1].
+        support: Squared distance of the zero-moment point out of the safe support area [1/m²].
         fall: Squared tilt of the base over the safe one, and height under it [1].
     """
 
@@ -35,6 +36,7 @@ class CostWeights:
     control: float = 0.002
     terminal: float = 2.0
     fall: float = 100.0
+    support: float = 30.0
 
 
 @dataclass(frozen=True)

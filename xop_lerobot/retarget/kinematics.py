@@ -29,13 +29,16 @@ class SiteKinematics:
     Args:
         model: Model whose bodies carry at most one free, hinge or slide joint each.
         sites: Names of the sites.
+        com_of: Body whose whole subtree `compute_com` is about, None if it is not needed.
 
     Raises:
         UnknownName: If a site is not in the model; carries its sites.
         BadValue: If a body on the way has a ball joint, or two joints.
     """
 
-    def __init__(self, model: mujoco.MjModel, sites: tuple[str, ...]) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, sites: tuple[str, ...], com_of: str | None = None
+    ) -> None:
         known = [model.site(i).name for i in range(model.nsite)]
         self._sites: dict[str, tuple[int, np.ndarray]] = {}
         chains: dict[str, list[int]] = {}
@@ -47,7 +50,9 @@ class SiteKinematics:
             self._sites[name] = (body, _make_transform(site.pos, site.quat))
             chains[name] = _find_chain(model, body)
         self._chains = chains
-        bodies = sorted({body for chain in chains.values() for body in chain})
+        self._masses = _find_masses(model, com_of) if com_of else {}
+        bodies = sorted({*(body for chain in chains.values() for body in chain), *self._masses})
+        self._bodies = bodies
         for body in bodies:
             _check_body(model, body)
         self._parent = {body: int(model.body_parentid[body]) for body in bodies}
@@ -79,8 +84,25 @@ class SiteKinematics:
         """Homogeneous transforms of `sites` (all by default). (..., nq) -> (..., 4, 4)."""
         sites = sites or tuple(self._sites)
         shape = qpos.shape[:-1]
-        flat = qpos.reshape(-1, qpos.shape[-1])
         needed = sorted({body for site in sites for body in self._chains[site]})
+        world = self._compute_world(qpos.reshape(-1, qpos.shape[-1]), needed)
+        return {
+            site: (world[self._sites[site][0]] @ self._sites[site][1]).reshape(*shape, 4, 4)
+            for site in sites
+        }
+
+    def compute_com(self, qpos: np.ndarray) -> np.ndarray:
+        """Centre of mass of the subtree `com_of` in the world [m]. (..., nq) -> (..., 3)."""
+        world = self._compute_world(qpos.reshape(-1, qpos.shape[-1]), self._bodies)
+        total = sum(mass for mass, _ in self._masses.values())
+        com = sum(
+            mass / total * (world[body][:, :3, :3] @ centre + world[body][:, :3, 3])
+            for body, (mass, centre) in self._masses.items()
+        )
+        return np.asarray(com).reshape(*qpos.shape[:-1], 3)
+
+    def _compute_world(self, flat: np.ndarray, needed: list[int]) -> dict[int, np.ndarray]:
+        """World transform of each body of `needed`, which holds its ancestors. (n, 4, 4)."""
         local = self._compute_local(flat, [body for body in needed if body in self._row])
         world: dict[int, np.ndarray] = {}
         for body in needed:
@@ -90,10 +112,7 @@ class SiteKinematics:
             own = local[body] if body in local else self._fixed[body]
             parent = self._parent[body]
             world[body] = world[parent] @ own if parent else np.broadcast_to(own, (len(flat), 4, 4))
-        return {
-            site: (world[self._sites[site][0]] @ self._sites[site][1]).reshape(*shape, 4, 4)
-            for site in sites
-        }
+        return world
 
     def compute_positions(
         self, qpos: np.ndarray, sites: tuple[str, ...] = ()
@@ -134,6 +153,16 @@ def _find_chain(model: mujoco.MjModel, body: int) -> list[int]:
         chain.append(body)
         body = int(model.body_parentid[body])
     return chain[::-1]
+
+
+def _find_masses(model: mujoco.MjModel, root: str) -> dict[int, tuple[float, np.ndarray]]:
+    """Mass and centre of mass of every body in the subtree of `root`."""
+    first = int(model.body(root).id)
+    return {
+        body: (float(model.body_mass[body]), model.body_ipos[body].copy())
+        for body in range(first, model.nbody)
+        if first in _find_chain(model, body)
+    }
 
 
 def _check_body(model: mujoco.MjModel, body: int) -> None:

@@ -21,6 +21,8 @@ from xop_lerobot.retarget.costs import (
     Evaluation,
     FallCost,
     StanceCost,
+    SupportArea,
+    SupportCost,
     TerminalCost,
     TrackingCost,
 )
@@ -70,8 +72,15 @@ class MpcRetargeter(Retargeter):
         obstacles = make_obstacles(model)
         hull = morphology.hull_points if obstacles else {}
         self._points = tuple(dict.fromkeys((*morphology.contact_points, *hull)))
-        self.kinematics = SiteKinematics(model, (*self.sites.values(), *self._points))
-        self.proposal = KinematicProposal(self.command_model, self.kinematics, self.sites)
+        self.support = SupportArea(morphology.support) if morphology.support else None
+        self.kinematics = SiteKinematics(
+            model,
+            (*self.sites.values(), *self._points),
+            com_of=morphology.base_body if self.support else None,
+        )
+        self.proposal = KinematicProposal(
+            self.command_model, self.kinematics, self.sites, support=self.support
+        )
         standing_height = float(morphology.standing_qpos()[2])
         self.costs: tuple[Cost, ...] = (
             TrackingCost(),
@@ -79,6 +88,7 @@ class MpcRetargeter(Retargeter):
             StanceCost(morphology.contact_groups, morphology.wheeled),
             CollisionCost(obstacles, hull),
             ControlCost(self.proposal.scale),
+            SupportCost(self.support),
             FallCost(morphology.fall_tilt, morphology.fall_height, standing_height),
         )
         self.cost_names = tuple(cost.name for cost in self.costs)
@@ -210,6 +220,10 @@ class MpcRetargeter(Retargeter):
         )
         terminal = self.kinematics.compute_poses(extrapolated, tuple(sites.values()))
         poses = self.kinematics.compute_poses(prediction.qpos, tuple(sites.values()))
+        com = terminal_com = np.zeros(0)
+        if self.support is not None:
+            com = self.kinematics.compute_com(prediction.qpos)
+            terminal_com = self.kinematics.compute_com(extrapolated)
         last = config.horizon * POLICY_DT + config.extrapolation_s
         evaluation = Evaluation(
             qpos=prediction.qpos,
@@ -218,6 +232,9 @@ class MpcRetargeter(Retargeter):
             reference=reference,
             poses={name: poses[site] for name, site in sites.items()},
             points=self.kinematics.compute_positions(prediction.qpos, self._points),
+            com=com,
+            terminal_qpos=extrapolated,
+            terminal_com=terminal_com,
             goals=goals,
             terminal_poses={name: terminal[site] for name, site in sites.items()},
             terminal_goals={

@@ -9,6 +9,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.transforms import rotation_error
 
@@ -23,18 +24,20 @@ class ProposalWeights:
         position: Of the position error along x, y, z [1/m].
         orientation: Of the orientation error about x, y, z [1/rad].
         effort: Of the command's distance from neutral, over its scale [1].
+        support: Of the centre of mass beyond the support area [1/m].
     """
 
     position: tuple[float, float, float] = (1.0, 1.0, 1.0)
     orientation: tuple[float, float, float] = (0.4, 0.4, 0.4)
     effort: float = 0.02
+    support: float = 10.0
 
 
 class KinematicProposal:
-    r"""Solves :math:`\min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \rho^2\|(a - a_0)/s\|^2`.
+    r"""Solves :math:`\min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \|\rho (a - a_0)/s\|^2`.
 
     φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` the neutral
-    command and s half the range of each entry. A few damped Gauss-Newton steps within the
+    command, s half the range of each entry and ρ its effort. A few damped Gauss-Newton steps within the
     bounds; the Jacobian by finite differences, all columns in one batch.
 
     Args:
@@ -42,6 +45,7 @@ class KinematicProposal:
         kinematics: Kinematics of the tracked frames' sites.
         sites: Site of each tracked frame.
         weights: Weights of the errors.
+        support: Area over which the centre of mass stays, None for a robot that balances itself.
         iterations: Number of Gauss-Newton steps.
     """
 
@@ -51,13 +55,15 @@ class KinematicProposal:
         kinematics: SiteKinematics,
         sites: Mapping[str, str],
         weights: ProposalWeights | None = None,
+        support: SupportArea | None = None,
         iterations: int = 4,
     ) -> None:
         self.command_model, self.kinematics, self.sites = command_model, kinematics, dict(sites)
         self.weights = weights or ProposalWeights()
-        self.iterations = iterations
+        self.support, self.iterations = support, iterations
         space = command_model.space
         self.scale = (space.high - space.low) / 2
+        self._effort = self.weights.effort * np.array([e.effort for e in command_model.effects])
 
     def solve(
         self,
@@ -89,15 +95,15 @@ class KinematicProposal:
         if not len(index) or not goals:
             return command
         low, high = space.low[index], space.high[index]
-        scale = self.scale[index]
+        scale, effort = self.scale[index], self._effort[index]
         for _ in range(self.iterations):
             batch = np.tile(command, (len(index) + 1, 1))
             batch[np.arange(1, len(index) + 1), index] += _STEP * scale
             residuals = self._compute_residuals(qpos, batch, goals, mode, dt)
             jacobian = (residuals[1:] - residuals[0]).T / _STEP  # per share of scale
-            pull = self.weights.effort * (command[index] - space.neutral[index]) / scale
-            matrix = jacobian.T @ jacobian + (self.weights.effort**2 + 1e-6) * np.eye(len(index))
-            gradient = jacobian.T @ residuals[0] + self.weights.effort * pull
+            pull = np.square(effort) * (command[index] - space.neutral[index]) / scale
+            matrix = jacobian.T @ jacobian + np.diag(np.square(effort) + 1e-6)
+            gradient = jacobian.T @ residuals[0] + pull
             step = _solve_in_box(
                 matrix, gradient, (low - command[index]) / scale, (high - command[index]) / scale
             )
@@ -121,6 +127,9 @@ class KinematicProposal:
             pose = poses[self.sites[name]]
             parts.append((pose[:, :3] - goal[:3]) * self.weights.position)
             parts.append(-rotation_error(goal[3:], pose[:, 3:]) * self.weights.orientation)
+        if self.support is not None:
+            com = self.kinematics.compute_com(future)[:, :2]
+            parts.append(self.weights.support * self.support.compute_excess(future[:, :7], com))
         return np.concatenate(parts, axis=1)
 
 

@@ -9,10 +9,17 @@ from xop_lerobot.retarget.config import CostWeights, MpcConfig
 PIVOT = 0.228
 """The wheels' axle is this far ahead of the base frame [m]."""
 
+SUPPORT = ((0.228, -0.265), (0.228, 0.265), (-0.275, 0.085), (-0.275, -0.085))
+"""Where the wheels and the casters touch the ground, in the base frame [m]."""
+
 EFFECTS = (
     Effect(Acts.FORWARD),
     Effect(Acts.TURN),
-    *(Effect(Acts.JOINT, f"torso_{i}", lag_s=0.1) for i in range(6)),
+    # Leaning sideways (torso 0 and 4) costs stability, turning the chest (torso 5) does not.
+    *(
+        Effect(Acts.JOINT, f"torso_{i}", lag_s=0.1, effort=effort)
+        for i, effort in enumerate((10.0, 4.0, 4.0, 4.0, 10.0, 1.0))
+    ),
 )
 
 TORSO_NOISE = {f"torso_{i}": 0.05 for i in range(6)}

@@ -5,6 +5,7 @@ from xop_lerobot.retarget.costs.control import ControlCost
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.costs.fall import FallCost
 from xop_lerobot.retarget.costs.stance import StanceCost
+from xop_lerobot.retarget.costs.support import SupportArea, SupportCost
 from xop_lerobot.retarget.costs.terminal import TerminalCost
 from xop_lerobot.retarget.costs.tracking import TrackingCost
 
@@ -15,6 +16,8 @@ __all__ = [
     "Evaluation",
     "FallCost",
     "StanceCost",
+    "SupportArea",
+    "SupportCost",
     "TerminalCost",
     "TrackingCost",
 ]

@@ -23,6 +23,9 @@ class Evaluation:
         reference: The command that costs nothing. Shape (k,).
         poses: Predicted pose of each tracked frame. Shapes (K, H + 1, 7).
         points: Predicted position of contact and hull sites. Shapes (K, H + 1, 3).
+        com: Predicted centre of mass, of robots with a support area. Shape (K, H + 1, 3).
+        terminal_qpos: Position at the end of the extrapolation. Shape (K, nq).
+        terminal_com: Centre of mass then, of robots with a support area. Shape (K, 3).
         goals: Goal of each tracked frame at every step. Shapes (H + 1, 7).
         terminal_poses: Pose of each tracked frame at the end of the extrapolation. (K, 7).
         terminal_goals: Goal of each tracked frame then. Shapes (7,).
@@ -37,6 +40,9 @@ class Evaluation:
     reference: np.ndarray
     poses: Mapping[str, np.ndarray]
     points: Mapping[str, np.ndarray]
+    com: np.ndarray
+    terminal_qpos: np.ndarray
+    terminal_com: np.ndarray
     goals: Mapping[str, np.ndarray]
     terminal_poses: Mapping[str, np.ndarray]
     terminal_goals: Mapping[str, np.ndarray]

@@ -1,0 +1,71 @@
+"""Support cost: a robot that cannot step must not tip over."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.transforms import quat_yaw
+
+GRAVITY = 9.81
+
+
+class SupportArea:
+    """The area on which a robot stands, shrunk by a margin.
+
+    Args:
+        corners: Corners (x, y) in the base's frame, counterclockwise [m]. Shape (c, 2).
+        margin: Distance that is kept from every edge [m].
+    """
+
+    def __init__(self, corners: tuple[tuple[float, float], ...], margin: float = 0.06) -> None:
+        points = np.array(corners, dtype=float)
+        edges = np.roll(points, -1, axis=0) - points
+        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)  # outwards
+        self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        self._offsets = (self._normals * points).sum(1) - margin
+
+    def compute_excess(self, base: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Distances of points beyond each edge, 0 inside [m]. (..., 7), (..., 2) -> (..., c)."""
+        yaw = quat_yaw(base[..., 3:])
+        dx, dy = points[..., 0] - base[..., 0], points[..., 1] - base[..., 1]
+        local = np.stack(
+            [np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx], axis=-1
+        )
+        return np.maximum(local @ self._normals.T - self._offsets, 0)
+
+
+class SupportCost(Cost):
+    r"""Squared distance of the zero-moment point beyond the shrunk support area.
+
+    .. math:: z = c_{xy} - \frac{c_z}{g}\,\ddot c_{xy}
+
+    with c the centre of mass and its acceleration the mean over the horizon, from finite
+    differences; and at the end of the extrapolation, where the robot shall be able to stand
+    still, the centre of mass itself. On flat ground the robot tips where z leaves the area
+    (Vukobratović and Borovac, 2004). The paper has no such term.
+
+    Args:
+        area: The support area, None for a robot whose policy keeps the balance.
+    """
+
+    name = "support"
+
+    def __init__(self, area: SupportArea | None) -> None:
+        self.area = area
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        if self.area is None:
+            return np.zeros(len(evaluation.qpos))
+        com, dt = evaluation.com, evaluation.dt
+        velocity = np.diff(com[..., :2], axis=1) / dt
+        span = max(velocity.shape[1] - 1, 1) * dt
+        acceleration = (velocity[:, -1] - velocity[:, 0]) / span
+        zmp = com[..., :2] - com[..., 2:] / GRAVITY * acceleration[:, None]
+        moving = self.area.compute_excess(evaluation.qpos[..., :7], zmp)
+        resting = self.area.compute_excess(
+            evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
+        )
+        excess = np.square(moving).sum(-1).mean(-1) + np.square(resting).sum(-1)
+        return evaluation.weights.support * excess
