@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -277,7 +278,7 @@ def test_rates_and_delays_are_whole_steps(noise: NoiseConfig, text: str) -> None
         ({"seed": -1}, "seed must be 0 or more, got -1"),
     ],
 )
-def test_simulation_setting_out_of_range(setting: dict[str, float], text: str) -> None:
+def test_simulation_setting_out_of_range(setting: dict[str, Any], text: str) -> None:
     with pytest.raises(BadValue) as error:
         SimulationConfig(**setting)
     assert str(error.value) == text

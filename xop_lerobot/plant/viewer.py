@@ -6,10 +6,12 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import cast
 
 import mujoco
 import numpy as np
 import trimesh
+import trimesh.visual
 
 from xop_lerobot.plant.gl import has_display
 
@@ -104,7 +106,9 @@ class BrowserViewer(Viewer):
         self._nodes: dict[int, viser.SceneNodeHandle] = {}
         scene = self._server.scene
         scene.set_up_direction("+z")
-        scene.add_grid("/floor", infinite_grid=True, cell_size=0.5, section_size=1.0)
+        scene.add_grid(
+            "/floor", infinite_grid=True, cell_size=0.5, section_size=1.0, fade_distance=25.0
+        )
         for body, mesh in build_body_meshes(model).items():
             name = model.body(body).name or f"body_{body}"
             self._nodes[body] = scene.add_mesh_trimesh(f"/bodies/{name}", mesh)
@@ -167,7 +171,10 @@ def build_body_meshes(model: mujoco.MjModel) -> dict[int, trimesh.Trimesh]:
             mesh, face_colors=np.rint(rgba * 255).astype(np.uint8)
         )
         parts.setdefault(int(model.geom_bodyid[geom]), []).append(mesh)
-    return {body: trimesh.util.concatenate(meshes) for body, meshes in parts.items()}
+    return {
+        body: cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
+        for body, meshes in parts.items()
+    }
 
 
 def _get_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
