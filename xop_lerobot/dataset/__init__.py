@@ -1,1 +1,1 @@
-"""Datasets: columns, recording in LeRobot's commands, durability. LeRobot is imported here alone."""
+"""Datasets: extra columns, recording in LeRobot's commands, and durability."""

@@ -14,7 +14,8 @@ import logging
 import math
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -129,6 +130,10 @@ class Host:
                     limit = count_ticks(duration, call["fps"]) if lockstep else None
                     dataset.begin(call["events"], limit)
                     call["control_time_s"] = math.inf if lockstep else duration
+                if lockstep:
+                    with _without_slowness():
+                        stock(**call)
+                    return
             stock(**call)
 
         return record_loop
@@ -138,6 +143,21 @@ class Host:
             return get_session(self._session).robot.name == getattr(robot, "name", None)
         except LinkError:
             return False
+
+
+@contextmanager
+def _without_slowness() -> Iterator[None]:
+    """Leave out LeRobot's warning of every slow tick: in lock-step none is wrong, only later."""
+
+    def is_other(record: logging.LogRecord) -> bool:
+        return not str(record.msg).startswith("Record loop is running slower")
+
+    root = logging.getLogger()
+    root.addFilter(is_other)
+    try:
+        yield
+    finally:
+        root.removeFilter(is_other)
 
 
 def count_ticks(duration: float, fps: int) -> int:
