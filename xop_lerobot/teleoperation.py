@@ -64,7 +64,7 @@ class Teleoperation:
         self._velocity = GoalVelocity()
         self._pinch = DoublePinchDetector()
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
-        self._arm_ik = ArmIk(self.morphology, model)
+        self._arm_ik = ArmIk(self.morphology)
         self._start_over()
 
     def _start_over(self) -> None:

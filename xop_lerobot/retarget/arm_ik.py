@@ -17,13 +17,12 @@ class ArmIk:
     """Differential inverse kinematics of the arms with mink, the rest of the body as measured.
 
     Each solve starts from the targets sent last, not from the measured arms, so that sensor
-    noise and sagging never reach the targets. Joint limits and a joint speed limit hold by
-    construction; the posture term pulls weakly towards the rest angles and keeps the elbows
-    from drifting through the null space.
+    noise and sagging never reach the targets. Joint limits, a joint speed limit and a distance
+    between the forearms and the rest of the body hold by construction; the posture term pulls
+    weakly towards the rest angles and keeps the elbows from drifting through the null space.
 
     Args:
         morphology: The robot.
-        model: Its planning model.
         max_speed: Speed limit of the arm joints [rad/s].
         iterations: Steps per solve.
     """
@@ -31,11 +30,11 @@ class ArmIk:
     def __init__(
         self,
         morphology: Morphology,
-        model: mujoco.MjModel,
         max_speed: float = 3.0,
         iterations: int = 2,
     ) -> None:
         self.iterations = iterations
+        model = morphology.build_spec("full").compile()
         joints = [joint for arm in morphology.arms for joint in arm.joints]
         self.num_joints = len(joints)
         self._qpos = np.array([int(model.joint(joint).qposadr[0]) for joint in joints])
@@ -62,6 +61,12 @@ class ArmIk:
         self._limits = [
             mink.ConfigurationLimit(model, gain=0.5),
             mink.VelocityLimit(model, dict.fromkeys(joints, max_speed)),
+            mink.CollisionAvoidanceLimit(
+                model,
+                _find_pairs(model, morphology),
+                minimum_distance_from_collisions=0.01,
+                collision_detection_distance=0.06,
+            ),
         ]
         limited = np.flatnonzero(model.jnt_limited)
         self._limited = model.jnt_qposadr[limited]
@@ -120,3 +125,33 @@ class ArmIk:
                 break
             self._configuration.integrate_inplace(velocity, step)
         return self._configuration.q[self._qpos]
+
+
+def _find_pairs(
+    model: mujoco.MjModel, morphology: Morphology
+) -> list[tuple[list[int], list[int]]]:
+    """Colliding geoms of each forearm and hand, against those of the rest of the body."""
+    solid = [i for i in range(model.ngeom) if model.geom_contype[i] and model.geom_conaffinity[i]]
+    pairs, forearms = [], []
+    for arm in morphology.arms:
+        whole = _find_subtree(model, arm.joints[0])
+        forearm = _find_subtree(model, arm.joints[len(arm.joints) // 2])
+        own = [i for i in solid if model.geom_bodyid[i] in forearm]
+        rest = [
+            i
+            for i in solid
+            if model.geom_bodyid[i] not in whole and model.geom_bodyid[i] not in forearms
+        ]
+        pairs.append((own, rest))
+        forearms.extend(forearm)
+    return pairs
+
+
+def _find_subtree(model: mujoco.MjModel, joint: str) -> set[int]:
+    """Bodies that `joint` moves."""
+    root = int(model.joint(joint).bodyid[0])
+    bodies = {root}
+    for body in range(root + 1, model.nbody):
+        if int(model.body_parentid[body]) in bodies:
+            bodies.add(body)
+    return bodies
