@@ -132,8 +132,8 @@ HEAD_FOVY = 58.0
 """Vertical field of view of the head camera [deg]."""
 
 WRIST_CAMERAS = (
-    Frame("left_wrist", "ee_left", (0, 0.13, 0.0), (0, -0.75, -0.66), (1, 0, 0)),
-    Frame("right_wrist", "ee_right", (0, -0.13, 0.0), (0, 0.75, -0.66), (1, 0, 0)),
+    Frame("left_wrist", "ee_left", (0, 0.16, 0.06), (0, -0.62, -0.78), (1, 0, 0)),
+    Frame("right_wrist", "ee_right", (0, -0.16, 0.06), (0, 0.62, -0.78), (1, 0, 0)),
 )
 """On the back of the hand, looking at the fingers."""
 
