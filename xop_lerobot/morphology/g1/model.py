@@ -15,17 +15,6 @@ if TYPE_CHECKING:
 TIMESTEP = 0.005
 """Physics step [s], as FALCON was trained."""
 
-LEG_JOINTS = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
-ARM_JOINTS = (
-    "shoulder_pitch",
-    "shoulder_roll",
-    "shoulder_yaw",
-    "elbow",
-    "wrist_roll",
-    "wrist_pitch",
-    "wrist_yaw",
-)
-
 GAINS = {
     "hip_pitch": (100.0, 2.5),
     "hip_roll": (100.0, 2.5),
