@@ -243,7 +243,7 @@ def test_unknown_preset_lists_the_known_ones() -> None:
 )
 def test_noise_out_of_range(noise: dict[str, float], text: str) -> None:
     with pytest.raises(BadValue) as error:
-        NoiseConfig(**noise)
+        SimulationConfig(sensors=NoiseConfig(**noise))
     assert str(error.value) == text
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import urllib.request
+from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -14,15 +17,13 @@ import pytest
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.errors import BadShape, BadValue, UnknownName
 from xop_lerobot.morphology.morphology import ArmChain, Morphology, make_morphology
-from xop_lerobot.plant.config import SimulationConfig
+from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
 from xop_lerobot.plant.gl import RenderingUnavailable, choose_backends, make_gl_context
 from xop_lerobot.plant.plant import Plant
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.transforms import quat_from_rpy
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from xop_lerobot.morphology.morphology import ModelKind
     from xop_lerobot.retarget.config import MpcConfig
 
@@ -625,3 +626,27 @@ def test_browser_meshes_are_as_large_as_the_geoms(robot: str) -> None:
         reach = max(float(np.linalg.norm(model.geom_pos[g]) + model.geom_rbound[g]) for g in geoms)
         farthest = float(np.linalg.norm(mesh.vertices, axis=1).max())
         assert 0.4 * reach < farthest <= reach + 1e-6, model.body(body).name
+
+
+def test_the_documented_example_runs() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "simulation.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)
+    assert names["picture"].shape == (240, 320, 3)
+    assert names["measured"].time == 0.02
+
+
+def test_the_documented_settings_are_the_real_ones() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "simulation.md").read_text(encoding="utf-8")
+    documented = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| `.*?\|", page, re.MULTILINE))))
+    settings = {setting.name for setting in fields(NoiseConfig)}
+    assert settings == documented & settings
+    for name, *values in re.findall(
+        r"^\| `(\w+)`[^|]*\|[^|]*\| ([\d.]+) \| ([\d.]+)[^|]*\| ([\d.]+)[^|]*\|$",
+        page,
+        re.MULTILINE,
+    ):
+        shown = dict(zip(("off", "mild", "harsh"), map(float, values), strict=True))
+        for preset, value in shown.items():
+            assert NOISE_PRESETS[preset].get(name) == pytest.approx(value, abs=2e-4), name

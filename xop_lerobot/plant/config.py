@@ -6,9 +6,7 @@ import math
 from dataclasses import dataclass, field, fields, replace
 
 from xop_lerobot.errors import BadValue, UnknownName
-
-POLICY_PERIOD = 0.02
-"""Period of the low-level policies [s]; the physics step must divide it."""
+from xop_lerobot.low_level.policy import POLICY_DT
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,11 @@ class NoiseConfig:
     encoder_rate: float | None = None  # samples per second, 0: every physics step [Hz]
     encoder_delay: float | None = None  # age of a sample when it arrives [s]
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
         """Check the range of every number that is given.
+
+        Not done at construction: LeRobot's command line parser builds this from flags, and hides
+        what a nested configuration raises behind "Couldn't instantiate".
 
         Raises:
             BadValue: Naming the setting and its range.
@@ -152,6 +153,7 @@ class SimulationConfig:
                 f"a picture must be at least 1 x 1 pixels, got {self.width} x {self.height}"
             )
         check_time_step(self.time_step)
+        self.sensors.check()
 
     @property
     def resolved_noise(self) -> NoiseConfig:
@@ -167,7 +169,7 @@ def check_time_step(time_step: float) -> None:
     """
     if not (math.isfinite(time_step) and time_step > 0):
         raise BadValue(f"the physics step must be a positive number of seconds, got {time_step}")
-    compute_num_steps(POLICY_PERIOD, time_step, "the policy's period")
+    compute_num_steps(POLICY_DT, time_step, "the policy's period")
 
 
 def compute_num_steps(duration: float, time_step: float, what: str = "a step") -> int:

@@ -114,12 +114,14 @@ class Sensors:
         time_step: Physics step [s].
 
     Raises:
-        BadValue: If a rate or delay is not a whole number of physics steps.
+        BadValue: If a number is out of its range, or a rate or delay is not a whole number of
+            physics steps.
     """
 
     def __init__(
         self, model: mujoco.MjModel, nq: int, nv: int, noise: NoiseConfig, time_step: float
     ) -> None:
+        noise.check()
         self.is_exact = noise.is_off
         self._has_base = model.njnt > 0 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
         self._base_q, self._base_v = (7, 6) if self._has_base else (0, 0)

@@ -183,7 +183,9 @@ def _get_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return np.array(model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom])
 
 
-def _build_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+def _build_mesh(  # noqa: PLR0911 one return a shape
+    model: mujoco.MjModel, geom: int
+) -> trimesh.Trimesh | None:
     """Build a geom's surface in its own frame; None for a plane or height field."""
     kinds = mujoco.mjtGeom
     kind, size = model.geom_type[geom], model.geom_size[geom]
