@@ -1,0 +1,298 @@
+"""What this project changes in LeRobot's modules, for whom, and when it stays out."""
+
+from __future__ import annotations
+
+import gc
+import json
+import logging
+import math
+import signal
+import types
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.configs.dataset import DatasetRecordConfig
+from lerobot.datasets import LeRobotDataset
+from lerobot.robots.config import RobotConfig
+from lerobot.robots.robot import Robot
+from lerobot.rollout import context as rollout_module
+from lerobot.scripts import lerobot_record as record_module
+from lerobot.teleoperators.config import TeleoperatorConfig
+from lerobot.teleoperators.teleoperator import Teleoperator
+from toy_robot import SMALL, XopToyConfig, make_teleop, make_toy
+
+from xop_lerobot.dataset import host
+from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.dataset.xop_dataset import DatasetExists, WrongFps, XopDataset
+from xop_lerobot.errors import LinkError
+
+STOCK_DATASET, STOCK_LOOP = LeRobotDataset, record_module.record_loop
+
+
+@pytest.fixture
+def session(request) -> str:
+    return request.node.name
+
+
+@pytest.fixture(autouse=True)
+def leave_lerobot_as_it_was():
+    yield
+    gc.collect()
+    assert record_module.LeRobotDataset is STOCK_DATASET
+    assert rollout_module.LeRobotDataset is STOCK_DATASET
+    assert record_module.record_loop is STOCK_LOOP
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+@RobotConfig.register_subclass("foreign")
+@dataclass(kw_only=True)
+class ForeignRobotConfig(RobotConfig):
+    pass
+
+
+class ForeignRobot(Robot):
+    config_class, name = ForeignRobotConfig, "foreign"
+    cameras: dict = {}
+    observation_features = {"joint.pos": float}
+    action_features = {"joint.pos": float}
+    is_calibrated = True
+    is_connected = False
+
+    def connect(self, calibrate=True):
+        self.is_connected, self.count = True, 0.0
+
+    def disconnect(self):
+        self.is_connected = False
+
+    def calibrate(self):
+        pass
+
+    def configure(self):
+        pass
+
+    def get_observation(self):
+        self.count += 1
+        return {"joint.pos": self.count}
+
+    def send_action(self, action):
+        return action
+
+
+@TeleoperatorConfig.register_subclass("foreign")
+@dataclass(kw_only=True)
+class ForeignTeleopConfig(TeleoperatorConfig):
+    pass
+
+
+class ForeignTeleop(Teleoperator):
+    config_class, name = ForeignTeleopConfig, "foreign"
+    action_features = {"joint.pos": float}
+    feedback_features = {}
+    is_calibrated = True
+    is_connected = False
+
+    def connect(self, calibrate=True):
+        self.is_connected = True
+
+    def disconnect(self):
+        self.is_connected = False
+
+    def calibrate(self):
+        pass
+
+    def configure(self):
+        pass
+
+    def get_action(self):
+        return {"joint.pos": 0.5}
+
+    def send_feedback(self, feedback):
+        pass
+
+
+def record(robot, teleop, root: Path, **dataset):
+    """LeRobot's own `record`, without a terminal."""
+    settings = {
+        "repo_id": "local/data", "single_task": "play", "root": root, "fps": 25,
+        "episode_time_s": 0.4, "reset_time_s": 0, "num_episodes": 2, "push_to_hub": False,
+        "no_stamp": True, "streaming_encoding": True,
+    }  # fmt: skip
+    flags = DatasetRecordConfig(**(settings | dataset))
+    config = record_module.RecordConfig(
+        robot=robot, dataset=flags, teleop=teleop, play_sounds=False
+    )
+    return record_module.record(config)
+
+
+def test_an_xop_teleoperator_brings_its_dataset(session):
+    teleop = make_teleop(session)
+    ours = record_module.LeRobotDataset
+    assert issubclass(ours, XopDataset)
+    assert ours.session_name == session
+    assert rollout_module.LeRobotDataset is ours
+    assert record_module.record_loop is not STOCK_LOOP
+    assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    teleop.disconnect()
+
+
+def test_two_teleoperators_leave_nothing_behind(session):
+    first, second = make_teleop(f"{session}-1"), make_teleop(f"{session}-2")
+    first.disconnect()
+    assert record_module.LeRobotDataset.session_name == f"{session}-2"
+    second.disconnect()
+
+
+def test_columns_can_be_left_out(session):
+    teleop = make_teleop(session)
+    teleop.host.remove()
+    bare = host.Host(session, extra_columns=False)
+    bare.install()
+    assert record_module.LeRobotDataset.extra_columns is False
+    bare.remove()
+    teleop.disconnect()
+
+
+def test_others_get_stock_datasets(session, tmp_path):
+    """A foreign pair records what it records without this project, column for column."""
+    make_teleop(session).disconnect()
+    dataset = record(ForeignRobotConfig(), ForeignTeleopConfig(), tmp_path / "data", fps=10)
+    assert type(dataset) is LeRobotDataset
+    info = json.loads((tmp_path / "data" / "meta" / "info.json").read_text())
+    assert set(info["features"]) == {
+        "action", "observation.state", "timestamp", "frame_index", "episode_index", "index",
+        "task_index",
+    }  # fmt: skip
+    assert not (tmp_path / "data" / "meta" / "xop").exists()
+    row = LeRobotDataset("local/data", root=tmp_path / "data").meta.episodes[0]
+    assert not [key for key in row if key.startswith("xop/")]
+
+
+def test_a_foreign_robot_with_an_xop_teleoperator_is_refused(session, tmp_path):
+    config = make_teleop(session).config
+    with pytest.raises(LinkError, match=f"no xop robot in session '{session}'"):
+        record(ForeignRobotConfig(), config, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def run_xop(session, root, teleop=None, **dataset):
+    robot = XopToyConfig(session=session, **SMALL)
+    return record(robot, teleop or make_teleop(session).config, root, **dataset)
+
+
+def test_lerobot_records_lockstep_episodes_of_exact_length(session, tmp_path, monkeypatch):
+    """However slow the machine: here LeRobot sees a clock that runs a thousand times as fast."""
+    ticks = iter(range(10**9))
+    clock = types.SimpleNamespace(perf_counter=lambda: float(next(ticks)), sleep=lambda _: None)
+    monkeypatch.setattr(record_module, "time", clock)
+    dataset = run_xop(session, tmp_path / "data", reset_time_s=60)
+    assert isinstance(dataset, XopDataset)
+    loaded = LeRobotDataset("local/data", root=tmp_path / "data")
+    assert (loaded.num_episodes, len(loaded)) == (2, 20)
+    assert loaded[19]["operator.engaged"].item()
+    assert [row["length"] for row in read_facts(tmp_path / "data")] == [10, 10]
+
+
+def test_the_same_seed_gives_the_same_dataset(session, tmp_path):
+    tables = []
+    for name in ("first", "second"):
+        run_xop(session, tmp_path / name, num_episodes=1)
+        dataset = LeRobotDataset("local/data", root=tmp_path / name)
+        tables.append((dataset.hf_dataset.with_format("numpy")[:], dataset[9]))
+    (first, last), (second, other) = tables
+    for key in set(first) - {"time.wall", "retargeter.health"}:
+        assert np.array_equal(np.stack(first[key]), np.stack(second[key])), key
+    image = "observation.images.head"
+    assert np.array_equal(last[image].numpy(), other[image].numpy())
+
+
+def test_an_episode_ends_when_the_device_has_played_out(session, tmp_path, monkeypatch):
+    from xop_lerobot.operator.devices.scripted import ScriptedDevice
+
+    monkeypatch.setattr(ScriptedDevice, "is_finished", lambda self, time: time > 1.1)
+    run_xop(session, tmp_path / "data", num_episodes=1, episode_time_s=60)
+    (facts,) = read_facts(tmp_path / "data")
+    assert facts["finished"] is True
+    assert facts["length"] == 4
+
+
+def test_mistakes_are_refused_before_the_robot_moves(session, tmp_path, monkeypatch):
+    monkeypatch.setattr("lerobot_robot_xop.xop_robot.XopRobot.connect", lambda *_: 1 / 0)
+    with pytest.raises(WrongFps):
+        run_xop(session, tmp_path / "data", fps=30)
+    with pytest.raises(DatasetExists):
+        run_xop(session, tmp_path)
+
+
+def test_a_slow_lockstep_loop_is_not_complained_of(session, tmp_path, monkeypatch, caplog):
+    robot, teleop = make_toy(session), make_teleop(session)
+    said = []
+
+    def loop(robot, events, fps, dataset=None, teleop=None, control_time_s=None):
+        logging.warning("Record loop is running slower (1 Hz)")
+        logging.warning("something else")
+        said.append(control_time_s)
+
+    wrapped = teleop.host._wrap_loop(loop)
+    dataset = types.SimpleNamespace(begin=lambda events, limit: said.append(limit))
+    wrapped(robot=robot, events={}, fps=25, dataset=dataset, control_time_s=2)
+    assert said == [50, math.inf]
+    assert [record.message for record in caplog.records] == ["something else"]
+    wrapped(robot=ForeignRobot(ForeignRobotConfig()), events={}, fps=25, control_time_s=3)
+    assert said[-1] == 3
+    teleop.disconnect()
+    robot.disconnect()
+
+
+def test_the_pause_between_episodes_is_for_people(session):
+    robot, teleop = make_toy(session), make_teleop(session)
+    paused = []
+
+    def loop(robot, events, fps, dataset=None, teleop=None, control_time_s=None):
+        paused.append(control_time_s)
+
+    person = host.Host(session, has_person=True)
+    for each in (teleop.host, person):
+        each._wrap_loop(loop)(robot=robot, events={}, fps=25, control_time_s=60)
+    assert paused == [60]
+    teleop.disconnect()
+    robot.disconnect()
+
+
+def moved_create(cls, name, fps, features, root=None):
+    """A `create` whose first parameter has another name."""
+
+
+def moved_loop(robot, events, fps, dataset=None, teleop=None):
+    """A `record_loop` without `control_time_s`."""
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "moved", "fault"),
+    [
+        (
+            LeRobotDataset,
+            "create",
+            classmethod(moved_create),
+            "LeRobotDataset.create() takes name, fps, features, root",
+        ),
+        (record_module, "record_loop", moved_loop, "record_loop() has no parameter control_time_s"),
+        (record_module, "LeRobotDataset", None, "lerobot.scripts.lerobot_record has no"),
+    ],
+)
+def test_if_lerobot_has_moved_it_is_left_alone(
+    session, monkeypatch, caplog, owner, name, moved, fault
+):
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, moved)
+        before = (record_module.LeRobotDataset, record_module.record_loop)
+        teleop = make_teleop(session)
+        assert (record_module.LeRobotDataset, record_module.record_loop) == before
+        assert f"LeRobot has changed ({fault}" in caplog.text
+        assert "recorded WITHOUT the operator's columns" in caplog.text
+        teleop.disconnect()
+
+
+def test_this_lerobot_has_no_fault():
+    assert host.find_fault([record_module, rollout_module]) == ""
