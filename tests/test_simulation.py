@@ -650,3 +650,20 @@ def test_the_documented_settings_are_the_real_ones() -> None:
         shown = dict(zip(("off", "mild", "harsh"), map(float, values), strict=True))
         for preset, value in shown.items():
             assert NOISE_PRESETS[preset].get(name) == pytest.approx(value, abs=2e-4), name
+
+
+def test_a_display_that_does_not_answer_leads_to_the_browser_view(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from xop_lerobot.plant.viewer import BrowserViewer  # noqa: PLC0415 loads a web server
+
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":9797")
+    simulation = make_toy(viewer=True, viewer_port=18413)
+    try:
+        assert isinstance(simulation._viewer, BrowserViewer)
+        assert "no window can be opened" in caplog.text
+        assert "showing the browser view" in caplog.text
+    finally:
+        simulation.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import cast
@@ -219,7 +220,7 @@ def start_viewer(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> Viewe
         data: Its first positions.
         port: Port of the page on this machine.
     """
-    if has_display():
+    if has_display() and _can_open_window():
         try:
             return WindowViewer(model, data)
         except Exception as fault:  # noqa: BLE001 a display that does not work is no reason to stop
@@ -227,3 +228,16 @@ def start_viewer(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> Viewe
     viewer = BrowserViewer(model, data, port)
     print(f"The simulation can be watched at {viewer.url}", flush=True)  # noqa: T201
     return viewer
+
+
+def _can_open_window() -> bool:
+    """Ask the window system itself: MuJoCo ends the process if its window can't be opened."""
+    import glfw  # noqa: PLC0415 loads the window system
+
+    with warnings.catch_warnings(record=True) as faults:
+        warnings.simplefilter("always")
+        can_open = bool(glfw.init())
+    if not can_open:
+        reason = str(faults[-1].message) if faults else "no reason given"
+        logger.warning("no window can be opened (%s); showing the browser view", reason)
+    return can_open
