@@ -16,6 +16,7 @@ import copy
 import json
 import logging
 import time
+from dataclasses import fields
 from pathlib import Path
 
 import mujoco
@@ -39,7 +40,7 @@ from xop_lerobot.morphology.scene import build_model
 
 logger = logging.getLogger("distill_low_level")
 
-TRAINING = ExcitationConfig(
+WIDE = ExcitationConfig(
     height=(0.48, 0.80),
     waist_yaw=1.1,
     waist_roll=0.5,
@@ -53,7 +54,10 @@ TRAINING = ExcitationConfig(
     push_period=4.0,
     hand_force=15.0,
 )
-"""Ranges of the training sequences: somewhat wider than what the robot is asked for."""
+"""Ranges of half of the training robots: wider than what a robot is asked for."""
+
+USUAL = ExcitationConfig(waist_roll=0.2, waist_pitch=(-0.2, 0.3), push_period=4.0)
+"""Ranges of the other half of the robots: about those of the comparison."""
 
 EPISODE_STEPS = 1000
 BLOCK_STEPS = 50
@@ -142,7 +146,7 @@ class Collector:
         simulation = self.simulation
         for step in range(steps):
             if self.excitation is None or self.step == EPISODE_STEPS:
-                self.excitation = make_excitation(self.rng, self.robots, EPISODE_STEPS, TRAINING)
+                self.excitation = make_training_excitation(self.rng, self.robots)
                 self.step = 0
             if step % BLOCK_STEPS == 0:
                 teaches = self.rng.uniform(size=self.robots) < share
@@ -179,6 +183,19 @@ class Collector:
         qvel[:, 3:6] += 0.03 * self.noise * normal((self.robots, 3))
         qvel[:, 6:] += 0.1 * self.noise * normal((self.robots, qvel.shape[1] - 6))
         return qpos, qvel
+
+
+def make_training_excitation(rng: np.random.Generator, robots: int) -> Excitation:
+    """Draw one episode: half of the robots in the wide ranges, the others in the usual ones."""
+    sizes = (robots // 2, robots - robots // 2)
+    parts = [
+        make_excitation(rng, size, EPISODE_STEPS, config)
+        for size, config in zip(sizes, (WIDE, USUAL), strict=True)
+    ]
+    names = [field.name for field in fields(Excitation)]
+    return Excitation(
+        **{name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in names}
+    )
 
 
 def randomise(model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjModel:
@@ -235,8 +252,13 @@ def distill(arguments: argparse.Namespace) -> Network:
         collector.falls = 0
         collector.collect(network, share, steps, experience)
         if network is None:
-            network = Network(tuple(arguments.hidden), experience.observations[: experience.size].float())
-        loss = train(network, experience, arguments.updates, (1e-3, 3e-4), arguments.batch, generator)
+            network = Network(
+                tuple(arguments.hidden), experience.observations[: experience.size].float()
+            )
+        loss = train(
+            network, experience, arguments.updates, (1e-3, 3e-4), arguments.batch, generator
+        )
+        save_weights(arguments.out, *network.layers())  # a long run leaves something if cut off
         logger.info(
             "round %d/%d: teacher share %.2f, falls %d, loss %.5f, %d samples, %.0f s",
             turn + 1, arguments.rounds, share, collector.falls, loss,
@@ -245,7 +267,9 @@ def distill(arguments: argparse.Namespace) -> Network:
     collector.simulation.close()
     best = copy.deepcopy(network)
     for part, rates in enumerate(((5e-4, 1e-4), (1e-4, 2e-5))):
-        loss = train(best, experience, arguments.final_updates // 2, rates, arguments.batch, generator)
+        loss = train(
+            best, experience, arguments.final_updates // 2, rates, arguments.batch, generator
+        )
         logger.info("final part %d: loss %.5f, %.0f s", part + 1, loss, time.monotonic() - start)
     return best
 
@@ -263,12 +287,12 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--docs", type=Path, help="Markdown page whose table is to be replaced")
     parser.add_argument("--evaluate-only", action="store_true", help="compare, do not train")
     parser.add_argument("--hidden", type=int, nargs="+", default=[384, 192], help="layer widths")
-    parser.add_argument("--rounds", type=int, default=40, help="rounds of DAgger")
+    parser.add_argument("--rounds", type=int, default=24, help="rounds of DAgger")
     parser.add_argument("--robots", type=int, default=256, help="robots at once")
     parser.add_argument("--steps", type=int, default=150, help="policy steps a round [20 ms]")
     parser.add_argument("--updates", type=int, default=300, help="gradient steps a round")
     parser.add_argument("--final-updates", type=int, default=8000, help="gradient steps at last")
-    parser.add_argument("--batch", type=int, default=2048, help="samples a gradient step")
+    parser.add_argument("--batch", type=int, default=1024, help="samples a gradient step")
     parser.add_argument("--trials", type=int, default=200, help="sequences of the comparison")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of a sequence [s]")
     parser.add_argument("--threads", type=int, default=2, help="threads")

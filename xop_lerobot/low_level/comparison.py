@@ -195,7 +195,9 @@ def write_table(report: Mapping[str, Any]) -> str:
         lines.append(f"| {label} | {' | '.join(numbers)} | {ratio} |")
     for n, slow in report["act_ms"]["teacher"].items():
         fast = report["act_ms"]["student"][n]
-        lines.append(f"| one call, batch of {n} [ms] | {slow:.2f} | {fast:.2f} | {fast / slow:.2f} |")
+        lines.append(
+            f"| one call, batch of {n} [ms] | {slow:.2f} | {fast:.2f} | {fast / slow:.2f} |"
+        )
     lines += [
         "",
         "Plain commands, held for 10 s (FALCON / student); means over the last 5 s:",

@@ -76,7 +76,7 @@ def _download(target: Path) -> Path:
     import pooch  # noqa: PLC0415
     import requests  # noqa: PLC0415
 
-    downloader = pooch.HTTPDownloader(progressbar=True, timeout=30)
+    downloader = pooch.HTTPDownloader(progressbar=True, timeout=(10, 60))
     try:
         pooch.retrieve(
             FALCON_URL,

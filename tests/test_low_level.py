@@ -1,0 +1,460 @@
+"""Low-level policies: files, purity, batches, and robots that stand, walk and drive with them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import requests
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadShape, PolicyFileError, UnknownName
+from xop_lerobot.low_level import policy_file
+from xop_lerobot.low_level.comparison import make_simulation, replace_table
+from xop_lerobot.low_level.diff_drive import DiffDrive, compute_wheel_speeds
+from xop_lerobot.low_level.excitation import ExcitationConfig, make_excitation
+from xop_lerobot.low_level.falcon import Falcon
+from xop_lerobot.low_level.falcon_observation import (
+    DEFAULT_POSTURE,
+    FRAME_SIZE,
+    JOINT_NAMES,
+    LOWER_LIMITS,
+    NUM_JOINTS,
+    UPPER_LIMITS,
+    build_observation,
+    compute_projected_gravity,
+    compute_targets,
+)
+from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput, make_policy
+from xop_lerobot.low_level.student import WEIGHTS_FILE, Student, load_weights, save_weights
+from xop_lerobot.low_level.trial import run_trials
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.transforms import quat_conjugate, quat_rotate
+
+SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[1] / ".." / "shared"))
+STAND = np.array([0.75, 0, 0, 0, 0, 0, 0])
+
+
+def find_teacher() -> str:
+    """Return FALCON's file, or skip."""
+    candidates = (
+        SHARED / "reference" / "falcon" / "falcon_g1_29dof.onnx",
+        policy_file.falcon_cache_path(),
+    )
+    for file in candidates:
+        if file.is_file():
+            return str(file)
+    pytest.skip("FALCON's network is neither in XOP_SHARED nor in the cache")
+
+
+@pytest.fixture(params=["default", "falcon", "diff_drive"], scope="module")
+def policy(request: pytest.FixtureRequest) -> LowLevelPolicy:
+    """Every policy of the registry."""
+    return make_policy(request.param, find_teacher() if request.param == "falcon" else None)
+
+
+def make_inputs(policy: LowLevelPolicy, n: int, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Random states, commands and arms of the robot that `policy` fits."""
+    rng = np.random.default_rng(seed)
+    morphology = make_morphology("rby1" if policy.name == "diff_drive" else "g1")
+    qpos = np.tile(morphology.standing_qpos(), (n, 1))
+    qpos[:, 7:] += rng.normal(0, 0.1, (n, qpos.shape[1] - 7))
+    qpos[:, 3:7] += rng.normal(0, 0.1, (n, 4))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    space = morphology.command_space
+    command = rng.uniform(space.low, space.high, (n, len(space)))
+    arms = morphology.rest_action().arms + rng.normal(0, 0.1, (n, len(morphology.arm_names)))
+    qvel = rng.normal(0, 0.3, (n, build_model(morphology, "planning").nv))
+    memory = rng.normal(0, 0.3, (n, policy.memory_size))
+    return qpos, qvel, command, arms, memory
+
+
+def test_unknown_policy_is_named_with_the_known_ones() -> None:
+    """A wrong name lists what there is."""
+    with pytest.raises(UnknownName) as error:
+        make_policy("falkon")
+    assert str(error.value) == (
+        "unknown low-level policy 'falkon'. Known: default, diff_drive, falcon"
+    )
+
+
+def test_every_default_of_a_robot_is_registered() -> None:
+    """What a morphology names can be made without a file."""
+    for robot in ("g1", "rby1"):
+        name = make_morphology(robot).policies[0]
+        assert make_policy(name).name == name
+
+
+def test_batch_equals_one_by_one(policy: LowLevelPolicy) -> None:
+    """A batch is the same as its members alone, in both modes."""
+    inputs = make_inputs(policy, 7)
+    for mode in Mode:
+        together = policy.act(*inputs, mode)
+        for row in range(7):
+            alone = policy.act(*(array[row : row + 1] for array in inputs), mode)
+            np.testing.assert_allclose(together.targets[row], alone.targets[0], atol=2e-5)
+            np.testing.assert_allclose(together.memory[row], alone.memory[0], atol=2e-5)
+
+
+def test_policy_is_pure(policy: LowLevelPolicy) -> None:
+    """No hidden state: inputs stay, what was asked between does not matter, nothing is shared."""
+    inputs = make_inputs(policy, 3)
+    kept = [array.copy() for array in inputs]
+    first = policy.act(*inputs, Mode.MOBILE)
+    for array, copy in zip(inputs, kept, strict=True):
+        np.testing.assert_array_equal(array, copy)
+    policy.act(*make_inputs(policy, 3, seed=1), Mode.STATIONARY)
+    again = policy.act(*inputs, Mode.MOBILE)
+    np.testing.assert_array_equal(first.targets, again.targets)
+    np.testing.assert_array_equal(first.memory, again.memory)
+    for output in first:
+        for array in inputs:
+            assert not np.shares_memory(output, array)
+
+
+def test_sizes(policy: LowLevelPolicy) -> None:
+    """Targets fit the model's actuators and memory its announced size."""
+    inputs = make_inputs(policy, 2)
+    robot = make_morphology("rby1" if policy.name == "diff_drive" else "g1")
+    output = policy.act(*inputs[:4], policy.initial_memory(2), Mode.STATIONARY)
+    assert isinstance(output, PolicyOutput)
+    assert output.targets.shape == (2, build_model(robot, "planning").nu)
+    assert output.memory.shape == (2, policy.memory_size)
+    with pytest.raises(BadShape, match=r"arms must have shape \(2, "):
+        policy.act(*inputs[:3], np.zeros((2, 3)), inputs[4], Mode.STATIONARY)
+
+
+def test_joint_tables_are_those_of_the_model() -> None:
+    """Order, limits and default posture are those of our G1."""
+    morphology = make_morphology("g1")
+    model = build_model(morphology, "planning")
+    assert tuple(model.joint(i + 1).name for i in range(NUM_JOINTS)) == JOINT_NAMES
+    assert list(model.actuator_trnid[:, 0]) == list(range(1, NUM_JOINTS + 1))
+    np.testing.assert_allclose(model.jnt_range[1:, 0], LOWER_LIMITS, atol=1e-4)
+    np.testing.assert_allclose(model.jnt_range[1:, 1], UPPER_LIMITS, atol=1e-4)
+    np.testing.assert_allclose(morphology.standing_qpos()[7:22], DEFAULT_POSTURE[:15])
+    assert morphology.arm_names == JOINT_NAMES[15:]
+
+
+def test_projected_gravity_is_the_rotated_one() -> None:
+    """The closed form equals R(q)^T (0, 0, -1)."""
+    quat = np.random.default_rng(0).normal(size=(20, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    plain = quat_rotate(quat_conjugate(quat), np.array([0, 0, -1.0]))
+    np.testing.assert_allclose(compute_projected_gravity(quat), plain, atol=1e-12)
+
+
+def test_observation_frame() -> None:
+    """Each number of a frame is at its place, scaled; older frames move up."""
+    n = 2
+    qpos, qvel, command, arms, memory = make_inputs(Student(), n)
+    now = build_observation(qpos, qvel, command, arms, memory, Mode.MOBILE)
+    np.testing.assert_array_equal(now[:, :460], memory[:, NUM_JOINTS + FRAME_SIZE :])
+    frame = now[:, 460:]
+    np.testing.assert_array_equal(frame[:, :29], memory[:, :29])
+    np.testing.assert_allclose(frame[:, 29:32], qvel[:, 3:6] / 4)
+    np.testing.assert_allclose(frame[:, 32:36], command[:, [6, 0, 4, 5]] * [1, 2, 1, 1])
+    assert (frame[:, 36] == 1).all()
+    np.testing.assert_allclose(frame[:, 37], command[:, 1])
+    angles = frame[:, 40:69] + DEFAULT_POSTURE
+    angles[:, 13:15] += command[:, 2:4]  # waist roll and pitch are relative to the command
+    np.testing.assert_allclose(angles, qpos[:, 7:], atol=1e-12)
+    np.testing.assert_allclose(frame[:, 69:98], qvel[:, 6:] / 20)
+    np.testing.assert_allclose(frame[:, 101:], arms)
+    stands = build_observation(qpos, qvel, command, arms, memory, Mode.STATIONARY)
+    assert (stands[:, 460 + 36] == 0).all()
+
+
+def test_memory_holds_the_last_five_frames_oldest_first() -> None:
+    """After k steps the memory is the last action and the frames of the last five steps."""
+    policy, frames = Student(), []
+    memory = policy.initial_memory(1)
+    for step in range(7):
+        inputs = make_inputs(policy, 1, seed=step)[:4]
+        targets, memory = policy.act(*inputs, memory, Mode.STATIONARY)
+        frames.append(memory[0, -FRAME_SIZE:])
+    np.testing.assert_array_equal(memory[0, NUM_JOINTS:], np.concatenate(frames[-5:]))
+    plain = compute_targets(memory[:, :NUM_JOINTS], inputs[2], inputs[3])
+    np.testing.assert_allclose(targets, plain)
+
+
+def test_targets_stay_within_the_limits_and_waist_tilt_is_direct() -> None:
+    """A wild action is clipped; waist roll and pitch get the commanded angle."""
+    command = np.array([[0.75, 0, 0.2, -0.3, 0, 0, 0]])
+    targets = compute_targets(np.full((1, 29), 80.0), command, np.zeros((1, 14)))
+    np.testing.assert_array_equal(np.delete(targets, [13, 14]), np.delete(UPPER_LIMITS, [13, 14]))
+    np.testing.assert_array_equal(targets[0, 13:15], [0.2, -0.3])
+
+
+@pytest.mark.parametrize("name", ["default", "falcon"])
+def test_g1_stands_and_walks(name: str) -> None:
+    """G1 stands for 4 s where it is, and walks for 4 s about as fast as asked."""
+    policy = make_policy(name, find_teacher() if name == "falcon" else None)
+    simulation = make_simulation(2, threads=1)
+    command = np.array([STAND, STAND + [0, 0, 0, 0, 0.5, 0, 0]])
+    mode, memory = np.array([Mode.STATIONARY, Mode.MOBILE]), policy.initial_memory(2)
+    arms = np.tile(make_morphology("g1").rest_action().arms, (2, 1))
+    for _ in range(200):
+        targets, memory = policy.act(simulation.qpos, simulation.qvel, command, arms, memory, mode)
+        simulation.step(targets)
+        assert not simulation.fallen().any()
+    position = simulation.qpos[:, :3]
+    assert np.linalg.norm(position[0, :2]) < 0.15
+    assert abs(position[0, 2] - 0.75) < 0.03
+    assert 1.2 < position[1, 0] < 2.4
+    simulation.close()
+
+
+def test_g1_squats_and_leans() -> None:
+    """The base follows the height, the waist its three angles."""
+    policy, simulation = Student(), make_simulation(2, threads=1)
+    final = np.array([[0.6, 0, 0, 0, 0, 0, 0], [0.75, 0.6, 0.15, 0.3, 0, 0, 0]])
+    arms = np.tile(make_morphology("g1").rest_action().arms, (2, 1))
+    memory = policy.initial_memory(2)
+    for step in range(250):
+        command = STAND + min(step / 50, 1) * (final - STAND)
+        targets, memory = policy.act(
+            simulation.qpos, simulation.qvel, command, arms, memory, Mode.STATIONARY
+        )
+        simulation.step(targets)
+    assert not simulation.fallen().any()
+    assert abs(simulation.qpos[0, 2] - 0.6) < 0.03
+    np.testing.assert_allclose(simulation.qpos[1, 19:22], [0.6, 0.15, 0.3], atol=0.12)
+    assert np.linalg.norm(simulation.qpos[:, :2], axis=1).max() < 0.3
+    simulation.close()
+
+
+def test_trials_count_falls_and_errors() -> None:
+    """A policy that holds still falls when pushed hard; the student does not when it is not."""
+
+    class Stiff(Student):
+        def infer(self, observation: np.ndarray) -> np.ndarray:
+            return np.zeros((len(observation), NUM_JOINTS), np.float32)
+
+    rng = np.random.default_rng(0)
+    hard = ExcitationConfig(push=2.0, push_period=0.5)
+    excitation = make_excitation(rng, 4, 200, hard)
+    simulation = make_simulation(4, threads=1)
+    assert run_trials(Stiff(), simulation, excitation).falls == 4  # noqa: PLR2004
+    easy = make_excitation(rng, 4, 200, ExcitationConfig(push=0.0, arm_range=0.2))
+    result = run_trials(Student(), simulation, easy)
+    assert result.falls == 0
+    assert result.height_rmse < 0.05  # noqa: PLR2004
+    assert result.planar_rmse < 0.4  # noqa: PLR2004
+    simulation.close()
+
+
+def test_excitation_is_reproducible_and_within_its_ranges() -> None:
+    """Same seed, same sequences; commands and arms within what was asked."""
+    config = ExcitationConfig()
+    first, again = (make_excitation(np.random.default_rng(3), 5, 300, config) for _ in range(2))
+    np.testing.assert_array_equal(first.command, again.command)
+    np.testing.assert_array_equal(first.push, again.push)
+    assert first.command[..., 0].min() >= 0.5 and first.command[..., 0].max() <= 0.75  # noqa: PLR2004, PT018
+    assert np.abs(first.command[..., 1]).max() <= config.waist_yaw
+    assert (first.arms >= LOWER_LIMITS[15:]).all() and (first.arms <= UPPER_LIMITS[15:]).all()  # noqa: PT018
+    assert np.abs(first.push).max() > 0
+
+
+def test_shipped_weights_are_small() -> None:
+    """At most 3 MB, float32."""
+    assert WEIGHTS_FILE.stat().st_size <= 3_000_000  # noqa: PLR2004
+    with np.load(WEIGHTS_FILE) as arrays:
+        assert {arrays[key].dtype for key in arrays.files} == {np.dtype("float32")}
+
+
+def test_student_file_errors(tmp_path: Path) -> None:
+    """A missing, malformed or misshapen file of weights is named."""
+    missing = tmp_path / "none.npz"
+    with pytest.raises(PolicyFileError) as error:
+        make_policy("default", str(missing))
+    assert str(error.value) == f"policy file '{missing}' does not exist"
+    text = tmp_path / "text.npz"
+    text.write_text("not weights")
+    with pytest.raises(PolicyFileError, match="is not an .npz of arrays"):
+        make_policy("default", str(text))
+    narrow = tmp_path / "narrow.npz"
+    save_weights(narrow, [np.zeros((100, 29))], [np.zeros(29)])
+    with pytest.raises(PolicyFileError) as error:
+        make_policy("default", str(narrow))
+    assert str(error.value) == (
+        f"policy file '{narrow}': layers must lead from 575 observations to 29 actions, "
+        "got matrices [(100, 29)]"
+    )
+
+
+def test_weights_round_trip(tmp_path: Path) -> None:
+    """What is saved is loaded, in float32."""
+    rng = np.random.default_rng(0)
+    weights, biases = (
+        [rng.normal(size=(575, 4)), rng.normal(size=(4, 29))],
+        [np.ones(4), np.ones(29)],
+    )
+    save_weights(tmp_path / "w.npz", weights, biases)
+    loaded, _ = load_weights(tmp_path / "w.npz")
+    for saved, back in zip(weights, loaded, strict=True):
+        np.testing.assert_array_equal(saved.astype(np.float32), back)
+
+
+def write_onnx(file: Path, inputs: int) -> Path:
+    """Write a one-layer network with a fixed batch of one."""
+    import onnx  # noqa: PLC0415
+
+    from xop_lerobot.low_level.onnx_network import build_mlp  # noqa: PLC0415
+
+    model = build_mlp([np.zeros((inputs, 29), np.float32)], [np.zeros(29, np.float32)])
+    for tensor in (*model.graph.input, *model.graph.output):
+        tensor.type.tensor_type.shape.dim[0].dim_value = 1
+    onnx.save(model, str(file))
+    return file
+
+
+def test_falcon_missing_path_is_named(tmp_path: Path) -> None:
+    """A path that leads nowhere is an error, no download."""
+    missing = tmp_path / "falcon.onnx"
+    with pytest.raises(PolicyFileError) as error:
+        make_policy("falcon", str(missing))
+    assert str(error.value) == (
+        f"policy file '{missing}' does not exist. Give FALCON's g1_29dof.onnx with "
+        "--robot.low_level.path=FILE, or no path to use the cached or downloaded one."
+    )
+
+
+def test_falcon_offline_names_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Absent and offline: the error says how to provide the file."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise requests.ConnectionError("no network")
+
+    monkeypatch.setattr(policy_file, "falcon_cache_path", lambda: tmp_path / "falcon.onnx")
+    monkeypatch.setattr(requests, "get", refuse)
+    with pytest.raises(PolicyFileError) as error:
+        make_policy("falcon")
+    assert str(error.value) == (
+        "FALCON's network is not on this machine and could not be downloaded (ConnectionError). "
+        "Three ways to provide it: (1) --robot.low_level.path=FILE with a copy of "
+        f"g1_29dof.onnx; (2) put it into the cache as '{tmp_path / 'falcon.onnx'}'; (3) be online "
+        f"once, it is downloaded from {policy_file.FALCON_URL}. "
+        "Or use --robot.low_level.type=default, which ships with the package."
+    )
+
+
+def test_falcon_downloaded_file_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A download of another checksum is refused and not kept."""
+    original = policy_file.FALCON_SHA256
+
+    class Answer:
+        headers: dict[str, str] = {"content-length": "5"}  # noqa: RUF012
+
+        def raise_for_status(self) -> None: ...
+
+        def close(self) -> None: ...
+
+        def iter_content(self, chunk_size: int) -> list[bytes]:
+            return [b"wrong"]
+
+    monkeypatch.setattr(policy_file, "falcon_cache_path", lambda: tmp_path / "falcon.onnx")
+    monkeypatch.setattr(requests, "get", lambda *_, **__: Answer())
+    with pytest.raises(PolicyFileError, match=f"does not have SHA-256 {original}"):
+        make_policy("falcon")
+    assert not (tmp_path / "falcon.onnx").exists()
+
+
+def test_falcon_altered_cache_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cached file of another checksum is refused."""
+    cached = write_onnx(tmp_path / "falcon.onnx", 575)
+    monkeypatch.setattr(policy_file, "falcon_cache_path", lambda: cached)
+    with pytest.raises(PolicyFileError) as error:
+        make_policy("falcon")
+    assert str(error.value) == (
+        f"policy file '{cached}' has SHA-256 {policy_file.compute_sha256(cached)}, expected "
+        f"{policy_file.FALCON_SHA256}. Delete it, and it will be downloaded again."
+    )
+
+
+def test_falcon_given_file_of_other_checksum_is_used_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One may train one's own FALCON; a fixed batch of one is made free."""
+    policy = Falcon(str(write_onnx(tmp_path / "own.onnx", 575)))
+    assert "not that of the released FALCON" in caplog.text
+    assert policy.infer(np.zeros((4, 575), np.float32)).shape == (4, 29)
+
+
+def test_falcon_wrong_shape_or_format(tmp_path: Path) -> None:
+    """A network of other inputs, or a file that is no network, is named."""
+    wrong = write_onnx(tmp_path / "wrong.onnx", 47)
+    with pytest.raises(PolicyFileError) as error:
+        Falcon(str(wrong))
+    assert str(error.value) == (
+        f"policy file '{wrong}': expected one input of shape (batch, 575), got [(1, 47)]"
+    )
+    text = tmp_path / "text.onnx"
+    text.write_text("not a network")
+    with pytest.raises(PolicyFileError, match="is not an ONNX model"):
+        Falcon(str(text))
+
+
+def test_wheel_speeds_by_hand() -> None:
+    """1 m/s forward is 10 rad/s on both wheels, backwards about their axes; turning differs."""
+    right, left = compute_wheel_speeds(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    np.testing.assert_allclose(right, [-10.0, -2.65])
+    np.testing.assert_allclose(left, [-10.0, 2.65])
+
+
+def test_rby1_drives_as_commanded() -> None:
+    """On the planning model the base moves and turns at the commanded speeds; the body holds."""
+    morphology = make_morphology("rby1")
+    model = build_model(morphology, "planning")
+    data, policy = mujoco.MjData(model), make_policy("diff_drive")
+    data.qpos[:] = morphology.standing_qpos()
+    rest = morphology.rest_action()
+    command = rest.command.copy()
+    space = morphology.command_space
+    command[space.index("v")], command[space.index("yaw_rate")] = 0.4, 0.5
+    for _ in range(100):
+        targets, _ = policy.act(
+            data.qpos[None], data.qvel[None], command[None], rest.arms[None],
+            np.zeros((1, 0)), Mode.MOBILE,
+        )  # fmt: skip
+        data.ctrl[:] = targets[0]
+        mujoco.mj_step(model, data, 4)
+    body = quat_rotate(quat_conjugate(data.qpos[3:7]), data.qvel[:3])
+    assert abs(data.qvel[5] - 0.5) < 0.05  # noqa: PLR2004
+    assert abs(body[0] - 0.4) < 0.05  # noqa: PLR2004
+    for name, target in zip(morphology.arm_names[:14], rest.arms, strict=False):
+        assert abs(data.joint(name).qpos[0] - target) < 0.03  # noqa: PLR2004
+
+
+def test_diff_drive_maps_by_name_and_clips() -> None:
+    """Torso and arm targets reach the actuator of their name, within its range; the head is 0."""
+    morphology, policy = make_morphology("rby1"), DiffDrive()
+    model = build_model(morphology, "planning")
+    qpos, qvel, command, arms, memory = make_inputs(policy, 1)
+    command[0, morphology.command_space.index("torso_1")] = 9.0
+    targets = policy.act(qpos, qvel, command, arms, memory, Mode.MOBILE).targets[0]
+    named = {model.actuator(i).name: targets[i] for i in range(model.nu)}
+    assert named["torso_1"] == model.actuator("torso_1").ctrlrange[1]
+    assert named["head_0"] == named["head_1"] == 0
+    for name, value in zip(morphology.arm_names, arms[0], strict=True):
+        low, high = model.actuator(name).ctrlrange
+        assert named[name] == np.clip(value, low, high)
+
+
+def test_diff_drive_takes_no_file() -> None:
+    """A path is an error."""
+    with pytest.raises(PolicyFileError) as error:
+        make_policy("diff_drive", "x.onnx")
+    assert str(error.value) == "low-level policy 'diff_drive' has no file, got 'x.onnx'"
+
+
+def test_table_goes_between_the_marks(tmp_path: Path) -> None:
+    """Only what is between the marks of a page is replaced."""
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- comparison -->\nold\n<!-- end of comparison -->\nb\n")
+    replace_table(page, "new\n")
+    assert page.read_text() == "a\n<!-- comparison -->\nnew\n<!-- end of comparison -->\nb\n"

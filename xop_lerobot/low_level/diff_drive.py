@@ -1,0 +1,116 @@
+"""The low-level controller of a robot with two driven wheels, a torso and arms: RB-Y1."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadShape, PolicyFileError
+from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput
+
+if TYPE_CHECKING:
+    from xop_lerobot.morphology.morphology import Morphology
+
+TRACK = 0.53
+"""Distance between the wheels [m]."""
+
+WHEEL_RADIUS = 0.1
+"""Radius of the wheels [m]."""
+
+
+def compute_wheel_speeds(v: np.ndarray, yaw_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    r"""Compute wheel speeds of a differential drive whose wheels turn about −Y.
+
+    .. math:: \omega_{r,l} = -(v \pm \tfrac{1}{2} b\,\Omega) / r
+
+    Args:
+        v: Forward velocity [m/s]. Shape (n,).
+        yaw_rate: Yaw rate Ω [rad/s]. Shape (n,).
+
+    Returns:
+        Speeds of the right and of the left wheel [rad/s]. Shapes (n,).
+    """
+    half = 0.5 * TRACK * yaw_rate
+    return -(v + half) / WHEEL_RADIUS, -(v - half) / WHEEL_RADIUS
+
+
+@POLICIES.register("diff_drive")
+class DiffDrive(LowLevelPolicy):
+    """Wheel speeds by the kinematics; torso, arms and grippers by their targets.
+
+    The servos are in the model: a torque proportional to the speed error at the wheels,
+    position control and gravity compensation at the joints. Which target goes where is found by
+    name: an actuator takes the command entry of its name, else the arm target of its name, else
+    zero (the head looks straight ahead). Targets are clipped to the actuators' ranges.
+
+    Args:
+        path: Must be None, this controller has no file.
+        morphology: The robot, None for RB-Y1.
+
+    Raises:
+        PolicyFileError: If a path is given.
+    """
+
+    name = "diff_drive"
+    memory_size = 0
+
+    def __init__(self, path: str | None = None, morphology: Morphology | None = None) -> None:
+        if path is not None:
+            raise PolicyFileError(f"low-level policy 'diff_drive' has no file, got '{path}'")
+        if morphology is None:
+            from xop_lerobot.morphology.morphology import make_morphology  # noqa: PLC0415
+
+            morphology = make_morphology("rby1")
+        model = morphology.build_spec("planning").compile()
+        actuators = [model.actuator(i).name for i in range(model.nu)]
+        commands, arms = morphology.command_space.names, morphology.arm_names
+        self._sizes = model.nq, model.nv, len(commands), len(arms)
+        self._wheels = actuators.index("right_wheel"), actuators.index("left_wheel")
+        drive = ("v", "yaw_rate")
+        self._drive = tuple(commands.index(name) if name in commands else None for name in drive)
+        self._from_command = _pairs(actuators, commands)
+        self._from_arms = _pairs(actuators, [a for a in arms if a not in commands], arms)
+        limited = model.actuator_ctrllimited.astype(bool)
+        self._low = np.where(limited, model.actuator_ctrlrange[:, 0], -np.inf)
+        self._high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
+
+    def initial_memory(self, n: int = 1) -> np.ndarray:
+        """Nothing to remember. Shape (n, 0)."""
+        return np.zeros((n, 0))
+
+    def act(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        command: np.ndarray,
+        arms: np.ndarray,
+        memory: np.ndarray,
+        mode: Mode,
+    ) -> PolicyOutput:
+        """Compute actuator targets for the next 20 ms; see `LowLevelPolicy.act`.
+
+        Raises:
+            BadShape: If an argument does not fit the robot.
+        """
+        n = len(qpos)
+        given = {"qpos": qpos, "qvel": qvel, "command": command, "arms": arms, "memory": memory}
+        for (name, array), size in zip(given.items(), (*self._sizes, 0), strict=True):
+            if np.shape(array) != (n, size):
+                raise BadShape(name, (n, size), np.shape(array))
+        targets = np.zeros((n, len(self._low)))
+        v, yaw_rate = (np.zeros(n) if i is None else command[:, i] for i in self._drive)
+        targets[:, self._wheels[0]], targets[:, self._wheels[1]] = compute_wheel_speeds(v, yaw_rate)
+        targets[:, self._from_command[0]] = command[:, self._from_command[1]]
+        targets[:, self._from_arms[0]] = arms[:, self._from_arms[1]]
+        return PolicyOutput(np.clip(targets, self._low, self._high, out=targets), np.zeros((n, 0)))
+
+
+def _pairs(
+    actuators: list[str], wanted: list[str] | tuple[str, ...], source: tuple[str, ...] | None = None
+) -> tuple[list[int], list[int]]:
+    """Return positions among `actuators` and in `source` of the names that both have."""
+    source = tuple(wanted) if source is None else source
+    names = [name for name in wanted if name in actuators]
+    return [actuators.index(name) for name in names], [source.index(name) for name in names]
