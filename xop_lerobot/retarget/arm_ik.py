@@ -64,8 +64,8 @@ class ArmIk:
             mink.CollisionAvoidanceLimit(
                 model,
                 _find_pairs(model, morphology),
-                minimum_distance_from_collisions=0.01,
-                collision_detection_distance=0.06,
+                minimum_distance_from_collisions=0.025,
+                collision_detection_distance=0.1,
             ),
         ]
         limited = np.flatnonzero(model.jnt_limited)

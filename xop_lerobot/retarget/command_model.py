@@ -9,6 +9,8 @@ from xop_lerobot.command import CommandSpace, Mode
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.transforms import quat_from_yaw, quat_multiply, quat_yaw
 
+_TWIST = (Acts.FORWARD, Acts.LEFT, Acts.TURN)
+
 
 class CommandModel:
     r"""Extrapolates a configuration under a command held for a time.
@@ -43,29 +45,47 @@ class CommandModel:
 
     def is_velocity(self) -> np.ndarray:
         """Which entries are velocities of the base. Shape (k,), bool."""
-        return np.array([e.acts in (Acts.FORWARD, Acts.LEFT, Acts.TURN) for e in self.effects])
+        return np.array([effect.acts in _TWIST for effect in self.effects])
+
+    def compute_twist(self, command: np.ndarray) -> np.ndarray:
+        """Commanded base velocity: along, across [m/s], yaw rate [rad/s]. (..., k) -> (..., 3)."""
+        twist = np.zeros((*command.shape[:-1], 3))
+        for i, effect in enumerate(self.effects):
+            if effect.acts in _TWIST:
+                twist[..., _TWIST.index(effect.acts)] += command[..., i]
+        return twist
 
     def extrapolate(
-        self, qpos: np.ndarray, command: np.ndarray, dt: float, mode: Mode
+        self,
+        qpos: np.ndarray,
+        command: np.ndarray,
+        dt: float,
+        mode: Mode,
+        drift: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Configuration after `dt` [s] of `command`. Shapes (..., nq), (..., k) -> (..., nq)."""
+        """Compute the configuration after `dt` of a command.
+
+        Args:
+            qpos: Configurations now. Shape (..., nq).
+            command: Commands that are held. Shape (..., k).
+            dt: How long [s].
+            mode: Mode of the robot; only what acts in it has an effect.
+            drift: Base velocity beyond the commanded one, as `compute_twist`. Shape (3,).
+
+        Returns:
+            Configurations then. Shape (..., nq).
+        """
         shape = np.broadcast_shapes(qpos.shape[:-1], command.shape[:-1])
         result = np.broadcast_to(qpos, (*shape, qpos.shape[-1])).copy()
-        forward = left = turn = np.zeros(shape)
         for i, (effect, acts) in enumerate(zip(self.effects, self.acting(mode), strict=True)):
-            if not acts:
-                continue
-            value = command[..., i]
-            if effect.acts is Acts.FORWARD:
-                forward = value
-            elif effect.acts is Acts.LEFT:
-                left = value
-            elif effect.acts is Acts.TURN:
-                turn = value
-            else:
+            if acts and effect.acts not in _TWIST:
                 share = 1 - np.exp(-dt / effect.lag_s)
                 address = self._address[i]
-                result[..., address] += share * (value - result[..., address])
+                result[..., address] += share * (command[..., i] - result[..., address])
+        if not (self.acting(mode) & self.is_velocity()).any():
+            return result
+        twist = self.compute_twist(command) + (0 if drift is None else drift)
+        forward, left, turn = np.moveaxis(np.broadcast_to(twist, (*shape, 3)), -1, 0)
         yaw = quat_yaw(result[..., 3:7])
         middle = yaw + turn * dt / 2  # heading halfway: the chord of the arc
         x, y = np.cos(middle), np.sin(middle)

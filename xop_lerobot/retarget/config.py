@@ -18,6 +18,7 @@ class CostWeights:
     Attributes:
         position: w_p, squared position error of each tracked frame [1/m²].
         orientation: w_θ, squared orientation error of each tracked frame [1/rad²].
+        tilt_share: Weight of a tilt over that of a turn about the vertical [1].
         stance: w_s, squared velocity of the points in contact [s²/m²].
         collision: w_c, proximity to obstacles [1].
         collision_velocity: w_v, speed near obstacles [s²/m²].
@@ -30,6 +31,7 @@ class CostWeights:
 
     position: float = 1.0
     orientation: float = 0.1
+    tilt_share: float = 1.0
     stance: float = 0.01
     collision: float = 1.0
     collision_velocity: float = 1.0

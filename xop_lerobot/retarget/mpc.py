@@ -27,6 +27,7 @@ from xop_lerobot.retarget.costs import (
     TrackingCost,
 )
 from xop_lerobot.retarget.costs.collision import make_obstacles
+from xop_lerobot.retarget.drift import DriftObserver
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.kmppi import Kmppi, compute_effective_samples
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
@@ -103,6 +104,7 @@ class MpcRetargeter(Retargeter):
             * self.command_model.acting(mode)
             for mode, each in self.configs.items()
         }
+        self.drift = DriftObserver(self.command_model)
         self._last: tuple[float, Mode] | None = None
 
     def control_period(self, mode: Mode) -> float:
@@ -117,6 +119,7 @@ class MpcRetargeter(Retargeter):
         """Start anew from the command that `state` executes, with the seed's first samples."""
         self._rng = np.random.default_rng(self._seed)
         self._last = None
+        self.drift.reset()
         for planner in self._planners.values():
             planner.reset(state.command)
 
@@ -125,6 +128,7 @@ class MpcRetargeter(Retargeter):
         start = perf_counter()
         mode, config, planner = goal.mode, self.configs[goal.mode], self._planners[goal.mode]
         self._warm_start(state, mode)
+        self.drift.update(state.time, state.qpos, state.command, mode is Mode.MOBILE)
         ahead = np.arange(config.horizon + 1) * POLICY_DT
         goals = self._preview(goal, ahead, config)
         proposal = self.proposal.solve(
@@ -133,6 +137,7 @@ class MpcRetargeter(Retargeter):
             mode,
             config.proposal_s,
             start=planner.commands[0],
+            drift=self.drift.drift,
         )
         candidates = np.stack([proposal, state.command, self.space.neutral])
         acting = self.command_model.acting(mode)
@@ -216,7 +221,11 @@ class MpcRetargeter(Retargeter):
         """Cost of every sample by term. Shapes (K,)."""
         sites = {name: self.sites[name] for name in goals}
         extrapolated = self.command_model.extrapolate(
-            prediction.qpos[:, -1], prediction.commands[:, -1], config.extrapolation_s, goal.mode
+            prediction.qpos[:, -1],
+            prediction.commands[:, -1],
+            config.extrapolation_s,
+            goal.mode,
+            self.drift.drift,
         )
         terminal = self.kinematics.compute_poses(extrapolated, tuple(sites.values()))
         poses = self.kinematics.compute_poses(prediction.qpos, tuple(sites.values()))

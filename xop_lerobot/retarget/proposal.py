@@ -73,6 +73,7 @@ class KinematicProposal:
         dt: float,
         *,
         start: np.ndarray | None = None,
+        drift: np.ndarray | None = None,
         free: np.ndarray | None = None,
     ) -> np.ndarray:
         """Compute the proposed command.
@@ -83,6 +84,7 @@ class KinematicProposal:
             mode: Mode of the robot; entries without effect in it stay neutral.
             dt: Time to get there [s].
             start: Where to start the iteration; neutral by default. Shape (k,).
+            drift: Base velocity beyond the commanded one. Shape (3,).
             free: Which entries may move; all that act by default. Shape (k,), bool.
 
         Returns:
@@ -99,7 +101,7 @@ class KinematicProposal:
         for _ in range(self.iterations):
             batch = np.tile(command, (len(index) + 1, 1))
             batch[np.arange(1, len(index) + 1), index] += _STEP * scale
-            residuals = self._compute_residuals(qpos, batch, goals, mode, dt)
+            residuals = self._compute_residuals(qpos, batch, goals, mode, dt, drift)
             jacobian = (residuals[1:] - residuals[0]).T / _STEP  # per share of scale
             pull = np.square(effort) * (command[index] - space.neutral[index]) / scale
             matrix = jacobian.T @ jacobian + np.diag(np.square(effort) + 1e-6)
@@ -118,9 +120,10 @@ class KinematicProposal:
         goals: Mapping[str, np.ndarray],
         mode: Mode,
         dt: float,
+        drift: np.ndarray | None,
     ) -> np.ndarray:
         """Weighted pose errors of a batch of commands. Shape (n, 6 · frames)."""
-        future = self.command_model.extrapolate(qpos, commands, dt, mode)
+        future = self.command_model.extrapolate(qpos, commands, dt, mode, drift)
         poses = self.kinematics.compute_poses(future, tuple(self.sites[name] for name in goals))
         parts = []
         for name, goal in goals.items():

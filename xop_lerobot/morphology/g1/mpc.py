@@ -32,7 +32,8 @@ CONFIGS = {
         noise_std={
             "waist_roll": 0.03, "waist_pitch": 0.05, "vx": 0.25, "vy": 0.2, "yaw_rate": 0.3,
         },
-        weights=CostWeights(orientation=0.2),
+        # A walking robot that leans as its operator does pays with its balance.
+        weights=CostWeights(orientation=0.1, tilt_share=0.2),
     ),
 }  # fmt: skip
 

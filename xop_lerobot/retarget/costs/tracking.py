@@ -6,6 +6,7 @@ import numpy as np
 
 from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.transforms import rotation_error
 
 
 class TrackingCost(Cost):
@@ -29,9 +30,12 @@ class TrackingCost(Cost):
 def compute_tracking(poses: np.ndarray, goals: np.ndarray, weights: CostWeights) -> np.ndarray:
     r"""Weighted squared error of poses. Shapes (..., 7) and (..., 7) -> (...).
 
-    The angle comes from :math:`|q \cdot q^d| = \cos(\alpha/2)`, which needs no quaternion product.
+    .. math:: w_p\|p - p^d\|^2 + w_\theta(e_z^2 + \kappa(e_x^2 + e_y^2)),\quad
+       e = \log(\theta^d \theta^{-1})
+
+    in world axes, with κ the share of a tilt: the paper's :math:`d(\theta, \theta^d)^2` at κ = 1.
     """
     position = np.square(poses[..., :3] - goals[..., :3]).sum(-1)
-    cosine = np.minimum(np.abs((poses[..., 3:] * goals[..., 3:]).sum(-1)), 1.0)
-    angle = 2 * np.arccos(cosine)
-    return weights.position * position + weights.orientation * np.square(angle)
+    error = np.square(rotation_error(goals[..., 3:], poses[..., 3:]))
+    turn = error[..., 2] + weights.tilt_share * (error[..., 0] + error[..., 1])
+    return weights.position * position + weights.orientation * turn
