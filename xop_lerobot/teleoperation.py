@@ -18,6 +18,7 @@ from xop_lerobot.operator.gestures import DoublePinchDetector, grip_from_pinch
 from xop_lerobot.operator.goal_velocity import GoalVelocity
 from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.retarget.arm_ik import ArmIk
+from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.kinematics import SiteKinematics
@@ -65,6 +66,7 @@ class Teleoperation:
         self._pinch = DoublePinchDetector()
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
         self._arm_ik = ArmIk(self.morphology)
+        self._background = BackgroundPlanner(self.retargeter) if info.realtime else None
         self._start_over()
 
     def _start_over(self) -> None:
@@ -74,7 +76,7 @@ class Teleoperation:
         self._mode = self.device.start_mode
         self._started = False
         self._plan: Plan | None = None
-        self._plan_time = -np.inf
+        self._plan_time = self._asked_time = -np.inf
         self._last_time: float | None = None
 
     def connect(self) -> None:
@@ -84,6 +86,8 @@ class Teleoperation:
     def disconnect(self) -> None:
         """Close the device and stop the threads; may be called twice."""
         self.device.disconnect()
+        if self._background is not None:
+            self._background.close()
         self.retargeter.close()
 
     def reset(self) -> None:
@@ -142,7 +146,7 @@ class Teleoperation:
         """Lay the operator on the robot and begin to drive it."""
         self.alignment.engage(frame, poses, float(poses["head"][2]))
         self._velocity.reset()
-        self.retargeter.reset(state)
+        (self._background or self.retargeter).reset(state)
         self._plan = None
 
     def disengage(self) -> None:
@@ -170,23 +174,34 @@ class Teleoperation:
     def _drive(
         self, state: RobotState, goal: Goal, head: np.ndarray, dt: float
     ) -> RobotAction:
-        period = self.retargeter.control_period(goal.mode)
-        late = self._plan is None or self._plan.mode is not goal.mode
-        # Half a tick early is closer than half a tick late.
-        if late or state.time - self._plan_time >= period - self.dt / 2:
-            self._plan = self.retargeter.plan(state, goal)
-            self._plan_time = state.time
-        assert self._plan is not None
+        self._update_plan(state, goal)
         arms = state.arms.copy()
         wrists = compute_wrist_goals(goal.poses, head)
         num_joints = self._arm_ik.num_joints
         arms[:num_joints] = self._arm_ik.solve(state.qpos, arms[:num_joints], wrists, dt)
         arms[num_joints:] = self._compute_grippers(goal)
+        if self._plan is None:  # the background planner is still at its first one
+            return RobotAction(self._hold(state).command, goal.mode, arms)
         return RobotAction(self._pick_command(self._plan, state.time), goal.mode, arms)
+
+    def _update_plan(self, state: RobotState, goal: Goal) -> None:
+        """Plan where it is due; on the wall clock, ask for it and take the newest there is."""
+        late = self._plan is None or self._plan.mode is not goal.mode
+        period = self.retargeter.control_period(goal.mode)
+        # Half a tick early is closer than half a tick late.
+        if self._background is None:
+            if late or state.time - self._plan_time >= period - self.dt / 2:
+                self._plan, self._plan_time = self.retargeter.plan(state, goal), state.time
+            return
+        if late or state.time - self._asked_time >= period - self.dt / 2:
+            self._background.submit(state, goal)
+            self._asked_time = state.time
+        if (latest := self._background.latest) is not None:
+            self._plan, self._plan_time = latest
 
     def _pick_command(self, plan: Plan, time: float) -> np.ndarray:
         """The plan's command for `time`; past its end the last one. Shape (k,)."""
-        step = round((time - self._plan_time) / POLICY_DT)
+        step = max(0, round((time - self._plan_time) / POLICY_DT))
         return plan.commands[min(step, len(plan.commands) - 1)]
 
     def _compute_grippers(self, goal: Goal) -> np.ndarray:

@@ -20,7 +20,8 @@ from xop_lerobot.morphology.scene import build_scene_spec
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
-    from xop_lerobot.plant.policy_loop import PolicyLoop, RealtimeLoop
+    from xop_lerobot.plant.policy_loop import PolicyLoop
+    from xop_lerobot.plant.realtime_loop import RealtimeLoop
     from xop_lerobot.plant.simulation import Simulation
 
 

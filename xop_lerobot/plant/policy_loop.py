@@ -23,20 +23,24 @@ class PolicyLoop:
         morphology: The robot.
         plant: Its body.
         policy: Its low-level policy.
+
+    Attributes:
+        action: What is being executed.
     """
 
     def __init__(self, morphology: Morphology, plant: Plant, policy: LowLevelPolicy) -> None:
         self.morphology, self.plant, self.policy = morphology, plant, policy
         self._memory = policy.initial_memory(1)
-        self._action = morphology.rest_action()
+        self.action = morphology.rest_action()
         self._measurement: Measurement | None = None
+        self._collision = False
 
     @property
     def state(self) -> RobotState:
         """The robot now, as measured; the same value until time passes."""
         if self._measurement is None:
             self._measurement = self.plant.measure()
-        measured, action = self._measurement, self._action
+        measured, action = self._measurement, self.action
         return RobotState(
             time=measured.time,
             qpos=freeze(measured.qpos),
@@ -50,7 +54,7 @@ class PolicyLoop:
             true_qvel=freeze(measured.true_qvel),
             wall_time=time.time(),
             fallen=measured.fallen,
-            collision=measured.collision,
+            collision=self._collision or measured.collision,
             settled=bool(np.linalg.norm(measured.true_qvel[:3]) < _SETTLED_SPEED),
         )
 
@@ -58,9 +62,10 @@ class PolicyLoop:
         """Put the robot at rest and let the policy settle it for `settle_s` [s]."""
         self.plant.reset(seed)
         self._memory = self.policy.initial_memory(1)
-        self._action = self.morphology.rest_action()
+        self.action = self.morphology.rest_action()
         self._measurement = None
-        self._advance(settle_s)
+        self.advance(settle_s)
+        self._collision = False
 
     def execute(self, action: RobotAction, dt: float) -> RobotAction:
         """Limit `action`, execute it for `dt` [s], and return what was executed.
@@ -68,27 +73,40 @@ class PolicyLoop:
         Raises:
             BadValue: If `dt` is not a whole multiple of the policy's period.
         """
-        self._action = limit_action(self.morphology, action, self._action, dt)
-        self._advance(dt)
-        return self._action
+        self.action = limit_action(self.morphology, action, self.action, dt)
+        self.advance(dt)
+        return self.action
 
-    def _advance(self, dt: float) -> None:
+    def advance(self, dt: float) -> None:
+        """Let `dt` [s] pass under the present action.
+
+        Raises:
+            BadValue: If `dt` is not a whole multiple of the policy's period.
+        """
         steps = round(dt / POLICY_DT)
         if abs(steps * POLICY_DT - dt) > 1e-9:  # noqa: PLR2004
-            raise BadValue(f"dt = {dt} s is not a whole multiple of the policy period {POLICY_DT} s")
-        for _ in range(steps):
-            measured = self._measurement or self.plant.measure()
-            targets, self._memory = self.policy.act(
-                measured.qpos[None],
-                measured.qvel[None],
-                self._action.command[None],
-                self._action.arms[None],
-                self._memory,
-                self._action.mode,
+            raise BadValue(
+                f"dt = {dt} s is not a whole multiple of the policy period {POLICY_DT} s"
             )
-            self.plant.apply(targets[0])
-            self.plant.step(POLICY_DT)
-            self._measurement = None
+        self._collision = False
+        for _ in range(steps):
+            self._run_policy()
+
+    def _run_policy(self) -> None:
+        """One period of the policy: measure, act, let 20 ms pass."""
+        measured = self._measurement or self.plant.measure()
+        targets, self._memory = self.policy.act(
+            measured.qpos[None],
+            measured.qvel[None],
+            self.action.command[None],
+            self.action.arms[None],
+            self._memory,
+            self.action.mode,
+        )
+        self.plant.apply(targets[0])
+        self.plant.step(POLICY_DT)
+        self._measurement = self.plant.measure()
+        self._collision |= self._measurement.collision
 
     def close(self) -> None:
         """Close the plant; may be called twice."""

@@ -1,0 +1,119 @@
+"""The policy loop on the wall clock, in a thread of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import threading
+import time
+
+import numpy as np
+
+from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.plant.plant import Plant
+from xop_lerobot.plant.policy_loop import PolicyLoop, limit_action
+from xop_lerobot.state import RobotState
+
+logger = logging.getLogger(__name__)
+
+_WATCHDOG_S = 0.5  # without a new action for so long the robot stops
+_MAX_LAG_S = 0.2  # further behind the wall clock the loop gives the lost time up
+
+
+class RealtimeLoop:
+    """Runs a `PolicyLoop` at 50 Hz against the wall clock.
+
+    `execute` hands over the newest action and returns at once; the policy never waits for the
+    caller. If no action comes for half a second, the robot stops where it is and holds its
+    posture. If the machine is too slow, simulated time falls behind and `late_ticks` counts it.
+
+    Args:
+        morphology: The robot.
+        plant: Its body; it must allow `measure` and `render` beside `step`.
+        policy: Its low-level policy.
+    """
+
+    def __init__(self, morphology: Morphology, plant: Plant, policy: LowLevelPolicy) -> None:
+        self.morphology = morphology
+        self._loop = PolicyLoop(morphology, plant, policy)
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._handed_over = 0.0
+        self._failure: BaseException | None = None
+        self.late_ticks = 0
+        """Policy periods that began more than one period late."""
+
+    @property
+    def state(self) -> RobotState:
+        """The robot now, as measured.
+
+        Raises:
+            Exception: Whatever ended the loop's thread.
+        """
+        if self._failure is not None:
+            raise self._failure
+        with self._lock:
+            return self._loop.state
+
+    def reset(self, seed: int | None = None, settle_s: float = 1.0) -> None:
+        """Put the robot at rest, let it settle (faster than the clock), then run."""
+        self._halt()
+        self._loop.reset(seed, settle_s)
+        self._stop.clear()
+        self._handed_over = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="xop-policy", daemon=True)
+        self._thread.start()
+
+    def execute(self, action: RobotAction, dt: float) -> RobotAction:
+        """Limit `action`, hand it over, and return what will be executed from now on."""
+        with self._lock:
+            limited = limit_action(self.morphology, action, self._loop.action, dt)
+            self._loop.action = limited
+            self._handed_over = time.monotonic()
+        return limited
+
+    def close(self) -> None:
+        """Stop the thread and close the plant; may be called twice."""
+        self._halt()
+        self._loop.close()
+
+    def _halt(self) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _run(self) -> None:
+        try:
+            self._run_until_stopped()
+        except BaseException as failure:  # noqa: BLE001  shown to the caller in `state`
+            self._failure = failure
+            logger.exception("the policy loop has ended")
+
+    def _run_until_stopped(self) -> None:
+        due = time.monotonic()
+        while not self._stop.is_set():
+            with self._lock:
+                self._guard()
+                self._loop.advance(POLICY_DT)
+            due += POLICY_DT
+            ahead = due - time.monotonic()
+            if ahead > 0:
+                self._stop.wait(ahead)
+                continue
+            self.late_ticks += ahead < -POLICY_DT
+            if ahead < -_MAX_LAG_S:
+                due = time.monotonic()
+            time.sleep(0)  # a loop that is always late must still let `execute` have the lock
+
+    def _guard(self) -> None:
+        """Stop the robot when nobody has commanded it for too long."""
+        if time.monotonic() - self._handed_over < _WATCHDOG_S:
+            return
+        action, space = self._loop.action, self.morphology.command_space
+        resting = np.where(space.mobile_only, space.neutral, action.command)
+        wanted = dataclasses.replace(action, command=resting, mode=Mode.STATIONARY)
+        self._loop.action = limit_action(self.morphology, wanted, action, POLICY_DT)
