@@ -12,7 +12,6 @@ what the teacher would have done in every state that was met. Afterwards, and al
 from __future__ import annotations
 
 import argparse
-import copy
 import json
 import logging
 import time
@@ -24,6 +23,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.comparison import compare_policies, replace_table, write_table
 from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
 from xop_lerobot.low_level.falcon import Falcon
@@ -144,6 +144,7 @@ class Collector:
     ) -> None:
         """Run `steps` steps with the teacher's `share` and add them to `experience`."""
         simulation = self.simulation
+        teaches = np.ones(self.robots, bool)
         for step in range(steps):
             if self.excitation is None or self.step == EPISODE_STEPS:
                 self.excitation = make_training_excitation(self.rng, self.robots)
@@ -246,7 +247,8 @@ def distill(arguments: argparse.Namespace) -> Network:
     robots, steps = arguments.robots, arguments.steps
     experience = Experience(arguments.rounds * robots * steps)
     collector = Collector(Falcon(arguments.teacher), robots, arguments.threads, rng)
-    network, start = None, time.monotonic()
+    start = time.monotonic()
+    network: Network | None = None
     for turn in range(arguments.rounds):
         share = max(0.0, 1.0 - turn / max(1, 0.3 * arguments.rounds))
         collector.falls = 0
@@ -265,13 +267,14 @@ def distill(arguments: argparse.Namespace) -> Network:
             experience.size, time.monotonic() - start,
         )  # fmt: skip
     collector.simulation.close()
-    best = copy.deepcopy(network)
+    if network is None:
+        raise BadValue(f"--rounds must be at least 1, got {arguments.rounds}")
     for part, rates in enumerate(((5e-4, 1e-4), (1e-4, 2e-5))):
         loss = train(
-            best, experience, arguments.final_updates // 2, rates, arguments.batch, generator
+            network, experience, arguments.final_updates // 2, rates, arguments.batch, generator
         )
         logger.info("final part %d: loss %.5f, %.0f s", part + 1, loss, time.monotonic() - start)
-    return best
+    return network
 
 
 def parse_arguments() -> argparse.Namespace:

@@ -36,7 +36,6 @@ def compute_wheel_speeds(v: np.ndarray, yaw_rate: np.ndarray) -> tuple[np.ndarra
     return -(v + half) / WHEEL_RADIUS, -(v - half) / WHEEL_RADIUS
 
 
-@POLICIES.register("diff_drive")
 class DiffDrive(LowLevelPolicy):
     """Wheel speeds by the kinematics; torso, arms and grippers by their targets.
 
@@ -105,6 +104,9 @@ class DiffDrive(LowLevelPolicy):
         targets[:, self._from_command[0]] = command[:, self._from_command[1]]
         targets[:, self._from_arms[0]] = arms[:, self._from_arms[1]]
         return PolicyOutput(np.clip(targets, self._low, self._high, out=targets), np.zeros((n, 0)))
+
+
+POLICIES.add("diff_drive", DiffDrive)
 
 
 def _pairs(

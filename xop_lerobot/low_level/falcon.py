@@ -15,7 +15,6 @@ from xop_lerobot.low_level.policy import POLICIES
 from xop_lerobot.low_level.policy_file import find_falcon_file
 
 
-@POLICIES.register("falcon")
 class Falcon(FalconLikePolicy):
     """FALCON (Zhang et al., 2025): two networks, for legs and waist and for the arms' residual.
 
@@ -42,3 +41,6 @@ class Falcon(FalconLikePolicy):
     def infer(self, observation: np.ndarray) -> np.ndarray:
         """Run the network; see `FalconLikePolicy.infer`."""
         return self._network(observation)
+
+
+POLICIES.add("falcon", Falcon)

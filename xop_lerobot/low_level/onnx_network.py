@@ -58,7 +58,7 @@ class OnnxNetwork:
 
     def __call__(self, batch: np.ndarray) -> np.ndarray:
         """Evaluate the network. Shape (n, num_inputs) -> (n, num_outputs), float32."""
-        return self._session.run(self._outputs, {self._input: batch})[0]
+        return np.asarray(self._session.run(self._outputs, {self._input: batch})[0])
 
 
 def _shape(tensor: onnx.ValueInfoProto) -> tuple[int | str, ...]:

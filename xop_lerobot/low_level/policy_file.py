@@ -83,7 +83,7 @@ def _download(target: Path) -> Path:
             known_hash=f"sha256:{FALCON_SHA256}",
             fname=target.name,
             path=target.parent,
-            downloader=downloader,
+            downloader=downloader,  # pyright: ignore[reportArgumentType] # pooch takes any callable
         )
     except (requests.RequestException, OSError) as error:
         raise PolicyFileError(
@@ -92,7 +92,7 @@ def _download(target: Path) -> Path:
             f"(1) --robot.low_level.path=FILE with a copy of g1_29dof.onnx; "
             f"(2) put it into the cache as '{target}'; "
             f"(3) be online once, it is downloaded from {FALCON_URL}. "
-            "Or use --robot.low_level.type=default, which ships with the package."
+            "Or use --robot.low_level.name=default, which ships with the package."
         ) from error
     except ValueError as error:  # pooch: the download does not have the known hash
         raise PolicyFileError(

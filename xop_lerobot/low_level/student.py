@@ -23,7 +23,6 @@ from xop_lerobot.low_level.policy import POLICIES
 WEIGHTS_FILE = Path(__file__).parent / "weights" / "g1_student.npz"
 
 
-@POLICIES.register("default")
 class Student(FalconLikePolicy):
     r"""Multilayer perceptron :math:`a = W_L \sigma(\dots W_0 o + b_0 \dots) + b_L`, σ = ELU.
 
@@ -48,6 +47,9 @@ class Student(FalconLikePolicy):
     def infer(self, observation: np.ndarray) -> np.ndarray:
         """Run the network; see `FalconLikePolicy.infer`."""
         return self._network(observation)
+
+
+POLICIES.add("default", Student)
 
 
 def load_weights(file: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:

@@ -11,8 +11,13 @@ from mujoco import rollout
 
 from xop_lerobot.command import Mode
 from xop_lerobot.low_level.excitation import Excitation
-from xop_lerobot.low_level.falcon_observation import NQ, NV, compute_projected_gravity
-from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+from xop_lerobot.low_level.falcon_observation import (
+    NQ,
+    NV,
+    FalconLikePolicy,
+    compute_projected_gravity,
+)
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.transforms import quat_rotate, quat_yaw
 
 FALL_HEIGHT = 0.35
@@ -44,7 +49,7 @@ class BatchSimulation:
         self._datas = [mujoco.MjData(model) for _ in range(max(threads, 1))]
         self._rollout = rollout.Rollout(nthread=threads)
         self._hands = [model.body(name).id for name in hands]
-        self._spec = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
+        self._spec = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
         self.state = np.zeros((len(models), 1 + NQ + NV))
         self.reset(np.ones(len(models), bool))
 
@@ -88,7 +93,7 @@ class BatchSimulation:
             np.repeat(control[:, None], self.substeps, axis=1),
             control_spec=self._spec,
         )
-        self.state = states[:, -1].copy()
+        self.state = np.array(states)[:, -1].copy()
 
     def fallen(self) -> np.ndarray:
         """Tell which robots have fallen. Shape (n,), bool."""
@@ -139,7 +144,7 @@ class TrialResult:
 
 
 def run_trials(
-    policy: LowLevelPolicy, simulation: BatchSimulation, excitation: Excitation
+    policy: FalconLikePolicy, simulation: BatchSimulation, excitation: Excitation
 ) -> TrialResult:
     """Run `policy` on every sequence of `excitation`, one robot each, and judge it."""
     steps, n, _ = excitation.command.shape
