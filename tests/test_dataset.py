@@ -11,11 +11,13 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from queue import Queue
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STR
@@ -23,7 +25,7 @@ from lerobot.utils.feature_utils import build_dataset_frame, dataset_to_policy_f
 from toy_robot import make_teleop, make_toy
 
 from xop_lerobot.command import Mode
-from xop_lerobot.dataset import durability
+from xop_lerobot.dataset import durability, embedding
 from xop_lerobot.dataset.columns import COST_NAMES, HEALTH_NAMES, Columns
 from xop_lerobot.dataset.facts import compute_config_hash, read_facts
 from xop_lerobot.dataset.record import build_features
@@ -224,6 +226,30 @@ def test_round_trip(session, pair, tmp_path):
     for key in set(first.columns) - different:
         assert np.array_equal(stack(first, key), stack(second, key)), key
     assert np.diff(stack(first, "time.sim")[:, 0]) == pytest.approx(1 / 25)
+
+
+@pytest.mark.parametrize("use_videos", [True, False])
+def test_tables_are_what_lerobot_writes(session, pair, tmp_path, monkeypatch, use_videos):
+    """Leaving out the pass that embeds image files changes nothing, and it stays where needed."""
+    robot, teleop = pair
+    features = build_features(robot, use_videos=use_videos)
+    tables = []
+    for name, skip in (("ours", embedding.skip_embedding), ("stock", lambda _: nullcontext())):
+        monkeypatch.setattr("xop_lerobot.dataset.xop_dataset.skip_embedding", skip)
+        bound = XopDataset.bind(session)
+        dataset = bound.create(
+            "local/toy", 25, features, root=tmp_path / name, use_videos=use_videos
+        )
+        for _ in range(5):
+            tick(robot, teleop, dataset)
+        dataset.save_episode()
+        dataset.finalize()
+        (path,) = dataset.root.glob("data/*/*.parquet")
+        tables.append(pq.read_table(path))
+    ours, stock = tables
+    assert ours.schema == stock.schema
+    for key in set(ours.column_names) - {"time.wall", "retargeter.health"}:
+        assert ours[key].to_pylist() == stock[key].to_pylist(), key
 
 
 def test_facts_of_an_episode(session, pair, tmp_path):
@@ -488,10 +514,10 @@ def test_signals_wait_for_the_save():
     assert done == ["saved"]
 
 
-def start_recording(root: Path, *flags: str) -> subprocess.Popen:
-    """`xop-record` with the toy, in a process of its own."""
+def start_recording(command: str, root: Path, *flags: str) -> subprocess.Popen:
+    """A recording of the toy by `command`, in a process of its own."""
     command = [
-        sys.executable, str(REPO / "tests" / "record_toy.py"), "xop-record",
+        sys.executable, str(REPO / "tests" / "record_toy.py"), command,
         "--robot.type=xop_toy", "--robot.width=64", "--robot.height=48", "--teleop.type=xop",
         "--teleop.device.path=g1_squat_walk_reach", "--teleop.retargeter.type=direct",
         "--dataset.repo_id=local/toy", f"--dataset.root={root}", "--dataset.fps=25",
@@ -509,18 +535,27 @@ def wait_for_episodes(process: subprocess.Popen, root: Path, number: int) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_killed_session_keeps_its_episodes(tmp_path, number):
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [
+        ("xop-record", signal.SIGTERM),
+        ("lerobot-record", signal.SIGTERM),
+        ("lerobot-record", signal.SIGKILL),
+    ],
+)
+def test_a_killed_session_keeps_its_episodes(tmp_path, command, number):
     root = tmp_path / "data"
-    process = start_recording(root, "--dataset.num_episodes=1000")
+    process = start_recording(command, root, "--dataset.num_episodes=1000")
     wait_for_episodes(process, root, 2)
     os.kill(process.pid, number)
     _, errors = process.communicate(timeout=120)
-    if number == signal.SIGTERM:
+    if number == signal.SIGKILL:
+        assert process.returncode == -signal.SIGKILL
+    elif command == "xop-record":
         assert process.returncode == 130, errors
         assert "stopped; the episodes that were saved stay" in errors
     else:
-        assert process.returncode == -signal.SIGKILL
+        assert "SIGTERM: stopping; the episodes that are saved stay." in errors
     loaded = LeRobotDataset("local/toy", root=root)
     assert loaded.num_episodes >= 2
     assert len(loaded) == 10 * loaded.num_episodes

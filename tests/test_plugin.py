@@ -16,9 +16,9 @@ import pytest
 from lerobot.robots.config import RobotConfig
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators.utils import make_teleoperator_from_config
-from lerobot_robot_xop import LowLevelConfig, SceneConfig, XopG1Config, XopRby1Config
 from toy_robot import ARM_JOINTS, SMALL, XopToy, XopToyConfig, make_teleop, make_toy
 
+from lerobot_robot_xop import LowLevelConfig, SceneConfig, XopG1Config, XopRby1Config
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadRecording, BadValue, LinkError, NotConnected, UnknownName
 from xop_lerobot.link import get_session
@@ -131,7 +131,8 @@ def test_nested_flags():
 BAD_CONFIGS = {
     "fps": (
         {"fps": 30},
-        "robot.fps must divide the low-level policy's 50 Hz, got 30. Use one of 1, 2, 5, 10, 25, 50",
+        "robot.fps must divide the low-level policy's 50 Hz, got 30. "
+        "Use one of 1, 2, 5, 10, 25, 50",
     ),
     "clock": (
         {"clock": "wall"},

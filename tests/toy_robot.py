@@ -17,10 +17,10 @@ os.environ.setdefault("HF_LEROBOT_HOME", tempfile.mkdtemp(prefix="lerobot-"))
 import mujoco
 import numpy as np
 from lerobot.robots.config import RobotConfig
+
 from lerobot_robot_xop.config_xop import XopRobotConfig
 from lerobot_robot_xop.xop_robot import XopRobot
 from lerobot_teleoperator_xop import Xop, XopConfig
-
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput
 from xop_lerobot.morphology.effect import Acts, Effect
@@ -78,9 +78,7 @@ class Toy(Morphology):
     policies = ("toy_hold",)
     frames: ClassVar = {name: name for name in ("head", "left_wrist", "right_wrist")}
     base_body = "box"
-    arms = tuple(
-        ArmChain(f"{side}_wrist", (f"{side}_shoulder", f"{side}_elbow")) for side in SIDES
-    )
+    arms = tuple(ArmChain(f"{side}_wrist", (f"{side}_shoulder", f"{side}_elbow")) for side in SIDES)
     arm_rest: ClassVar = {}
     contact_points = ("foot_0", "foot_1", "foot_2", "foot_3")
     contact_groups = (contact_points,)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import weakref
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,13 +75,13 @@ class XopRobot(Robot):
             **dataclasses.asdict(self.config),
         }
 
-    @cached_property
+    @property
     def observation_features(self) -> dict[str, type | tuple[int, int, int]]:
         """Proprioception as floats, then a picture of each camera (height, width, 3)."""
         size = (self.config.height, self.config.width, 3)
         return {**dict.fromkeys(self._body.state_keys, float), **dict.fromkeys(self.cameras, size)}
 
-    @cached_property
+    @property
     def action_features(self) -> dict[str, type]:
         """Whole-body command, mode, arm joints and grippers, all floats."""
         return dict.fromkeys(self.morphology.layout.keys, float)

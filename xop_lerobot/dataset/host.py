@@ -26,6 +26,8 @@ from xop_lerobot.link import get_session
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
+    from xop_lerobot.dataset.xop_dataset import XopDataset
+
 logger = logging.getLogger(__name__)
 
 RECORD_MODULE = "lerobot.scripts.lerobot_record"
@@ -122,14 +124,15 @@ class Host:
             call = signature.bind(*args, **kwargs).arguments
             if self._is_ours(call["robot"]):
                 lockstep = not get_session(self._session).robot.realtime
-                dataset, duration = call.get("dataset"), call.get("control_time_s")
+                dataset: XopDataset | None = call.get("dataset")
                 if dataset is None and lockstep and not self._has_person:
                     # The robot resets itself, and nobody has to tidy a simulation.
                     return
-                if hasattr(dataset, "begin"):
-                    limit = count_ticks(duration, call["fps"]) if lockstep else None
-                    dataset.begin(call["events"], limit)
-                    call["control_time_s"] = math.inf if lockstep else duration
+                if dataset is not None and lockstep:
+                    dataset.begin(call["events"], count_ticks(call["control_time_s"], call["fps"]))
+                    call["control_time_s"] = math.inf
+                elif dataset is not None:
+                    dataset.begin(call["events"], None)
                 if lockstep:
                     with _without_slowness():
                         stock(**call)

@@ -13,9 +13,10 @@ ends without a traceback. Example:
 import logging
 import sys
 import time
-from collections.abc import MutableMapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, MutableMapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
 
 from lerobot.configs import parser
 from lerobot.datasets import (
@@ -26,7 +27,7 @@ from lerobot.datasets import (
 from lerobot.processor import make_default_processors
 from lerobot.robots import Robot, make_robot_from_config
 from lerobot.scripts.lerobot_record import RecordConfig
-from lerobot.teleoperators import Teleoperator, make_teleoperator_from_config
+from lerobot.teleoperators import make_teleoperator_from_config
 from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame, combine_feature_dicts
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -39,13 +40,16 @@ from lerobot.utils.visualization_utils import (
     shutdown_visualization,
 )
 
+from lerobot_robot_xop import XopRobotConfig
+from lerobot_teleoperator_xop import XopConfig
 from xop_lerobot.dataset.host import count_ticks
-from xop_lerobot.dataset.shutdown import TermAsInterrupt
+from xop_lerobot.dataset.shutdown import stop_on_sigterm
 from xop_lerobot.dataset.xop_dataset import XopDataset
 from xop_lerobot.errors import BadValue, XopError
 
 if TYPE_CHECKING:
-    from lerobot_teleoperator_xop.config_xop import XopConfig
+    from lerobot_robot_xop.xop_robot import XopRobot
+    from lerobot_teleoperator_xop.xop import Xop
 
 logger = logging.getLogger(__name__)
 
@@ -76,11 +80,15 @@ class Recording:
     """
 
     config: XopRecordConfig
-    robot: Robot
-    teleop: Teleoperator
+    robot: "XopRobot"
+    teleop: "Xop"
     dataset: XopDataset
-    events: MutableMapping[str, bool] = field(default_factory=dict)
-    realtime: bool = False
+    events: MutableMapping[str, bool]
+
+    @property
+    def realtime(self) -> bool:
+        """Whether the robot's clock is the wall clock."""
+        return self.robot.config.clock == "realtime"
 
     def run(self) -> None:
         """Record the episodes that `config` asks for."""
@@ -137,67 +145,79 @@ class Recording:
 def record(config: XopRecordConfig) -> XopDataset:
     """Record episodes of an xop robot with an xop teleoperator."""
     init_logging()
-    robot_config, teleop_config = config.robot, config.teleop
-    check_types(robot_config.type, teleop_config.type if teleop_config else "none")
-    robot = make_robot_from_config(config.robot)
-    teleop: Any = make_teleoperator_from_config(config.teleop)
+    robot_config, teleop_config = check_types(config)
+    robot = cast("XopRobot", make_robot_from_config(robot_config))
+    teleop = cast("Xop", make_teleoperator_from_config(teleop_config))
     # LeRobot's own loop is not used here, so it needs no help.
     teleop.host.remove()
-    terminator = TermAsInterrupt()
-    terminator.install()
-    dataset = listener = None
-    try:
-        if config.display_data:
-            init_visualization(
-                config.display_mode,
-                session_name="recording",
-                ip=config.display_ip,
-                port=config.display_port,
-            )
-        dataset = open_dataset(config, robot, robot_config.session, teleop_config)
-        teleop.connect()
-        robot.connect()
-        listener, events = init_keyboard_listener()
-        realtime = robot_config.clock == "realtime"
-        with VideoEncodingManager(dataset):
-            Recording(config, robot, teleop, dataset, events, realtime).run()
-    finally:
-        if dataset is not None:
-            dataset.finalize()
-        robot.disconnect()
-        teleop.disconnect()
-        if listener is not None:
-            listener.stop()
-        if config.display_data:
-            shutdown_visualization(config.display_mode)
-        terminator.remove()
+    with stop_on_sigterm(), show_data(config):
+        try:
+            dataset = open_dataset(config, robot, teleop)
+            try:
+                record_episodes(config, robot, teleop, dataset)
+            finally:
+                dataset.finalize()
+        finally:
+            robot.disconnect()
+            teleop.disconnect()
     if config.dataset.push_to_hub and dataset.num_episodes > 0:
         dataset.push_to_hub(tags=config.dataset.tags, private=config.dataset.private)
     return dataset
 
 
-def check_types(robot: str, teleop: str) -> None:
-    """Check that robot and teleoperator are this project's.
+def record_episodes(
+    config: XopRecordConfig, robot: "XopRobot", teleop: "Xop", dataset: XopDataset
+) -> None:
+    """Connect both devices and record into `dataset`."""
+    teleop.connect()
+    robot.connect()
+    listener, events = init_keyboard_listener()
+    try:
+        with VideoEncodingManager(dataset):
+            Recording(config, robot, teleop, dataset, events).run()
+    finally:
+        if listener is not None:
+            listener.stop()
+
+
+@contextmanager
+def show_data(config: XopRecordConfig) -> Iterator[None]:
+    """Show observations and actions in LeRobot's viewer, if the flags ask for it."""
+    if not config.display_data:
+        yield
+        return
+    init_visualization(
+        config.display_mode,
+        session_name="recording",
+        ip=config.display_ip,
+        port=config.display_port,
+    )
+    try:
+        yield
+    finally:
+        shutdown_visualization(config.display_mode)
+
+
+def check_types(config: XopRecordConfig) -> tuple[XopRobotConfig, XopConfig]:
+    """Return the configurations of robot and teleoperator, which must be this project's.
 
     Raises:
         BadValue: If one isn't; `lerobot-record` takes all of them.
     """
-    if not robot.startswith("xop_") or teleop != "xop":
-        raise BadValue(
-            "xop-record takes --robot.type=xop_g1 or xop_rby1 and --teleop.type=xop, got "
-            f"{robot} and {teleop}. Use lerobot-record for others"
-        )
+    robot, teleop = config.robot, config.teleop
+    if isinstance(robot, XopRobotConfig) and isinstance(teleop, XopConfig):
+        return robot, teleop
+    raise BadValue(
+        "xop-record takes --robot.type=xop_g1 or xop_rby1 and --teleop.type=xop, got "
+        f"{robot.type} and {teleop.type if teleop else 'none'}. Use lerobot-record for others"
+    )
 
 
-def open_dataset(
-    config: XopRecordConfig,
-    robot: Robot,
-    session: str,
-    teleop: "XopConfig",
-) -> XopDataset:
+def open_dataset(config: XopRecordConfig, robot: "XopRobot", teleop: "Xop") -> XopDataset:
     """Create the dataset that the flags describe, or open it to add to it."""
     flags = config.dataset
-    bound = XopDataset.bind(session, extra_columns=teleop.record.columns)
+    columns = teleop.config.record.columns
+    bound = XopDataset.bind(robot.config.session, extra_columns=columns)
     options = {
         "root": flags.root,
         "batch_encoding_size": flags.video_encoding_batch_size,
@@ -241,11 +261,9 @@ def build_features(robot: Robot, *, use_videos: bool) -> dict[str, dict]:
 
 def main() -> None:
     """Run `xop-record`; a mistake of the user's ends in one line and not in a traceback."""
-    import lerobot_teleoperator_xop  # noqa: F401, PLC0415  also where it is not installed
-
     register_third_party_plugins()
     try:
-        record()
+        record()  # pyright: ignore[reportCallIssue]  the parser makes the argument
     except KeyboardInterrupt:
         print("stopped; the episodes that were saved stay", file=sys.stderr)
         sys.exit(INTERRUPTED)

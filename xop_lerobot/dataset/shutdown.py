@@ -49,6 +49,17 @@ def _ignore(number: int, frame: FrameType | None) -> None:
 
 
 @contextmanager
+def stop_on_sigterm() -> Iterator[None]:
+    """In the block, treat SIGTERM as Ctrl-C; see `TermAsInterrupt`."""
+    terminator = TermAsInterrupt()
+    terminator.install()
+    try:
+        yield
+    finally:
+        terminator.remove()
+
+
+@contextmanager
 def hold_signals() -> Iterator[None]:
     """Keep SIGINT and SIGTERM back until the block is done, then let them act."""
     if threading.current_thread() is not threading.main_thread():

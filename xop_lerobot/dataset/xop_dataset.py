@@ -12,13 +12,14 @@ import shutil
 import time
 from collections.abc import MutableMapping
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from xop_lerobot.dataset import durability
 from xop_lerobot.dataset.columns import Columns, is_own_column
+from xop_lerobot.dataset.embedding import skip_embedding
 from xop_lerobot.dataset.facts import (
     FACTS_PREFIX,
     EpisodeFacts,
@@ -98,7 +99,8 @@ class XopDataset(LeRobotDataset):
     def bind(cls, session: str, *, extra_columns: bool = True) -> type[Self]:
         """Return this class for the session `session`."""
         names = {"session_name": session, "extra_columns": extra_columns}
-        return type(cls.__name__, (cls,), {**names, "__doc__": cls.__doc__})
+        bound = type(cls.__name__, (cls,), {**names, "__doc__": cls.__doc__})
+        return cast("type[Self]", bound)
 
     @classmethod
     def create(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -119,7 +121,7 @@ class XopDataset(LeRobotDataset):
             raise DatasetExists(folder)
         columns = Columns(info) if cls.extra_columns else None
         features = {**features, **(columns.features if columns else {})}
-        dataset = super().create(repo_id, fps, features, root=root, **options)
+        dataset = cast("Self", super().create(repo_id, fps, features, root=root, **options))
         dataset._begin_session(info, columns, options)
         dataset._own_root = True
         return dataset
@@ -137,7 +139,7 @@ class XopDataset(LeRobotDataset):
             WrongFps: If the robot runs at another rate.
         """
         info = get_session(cls.session_name).robot
-        dataset = super().resume(repo_id, root=root, **options)
+        dataset = cast("Self", super().resume(repo_id, root=root, **options))
         if dataset.fps != info.fps:
             raise WrongFps(info.fps, dataset.fps)
         columns = Columns(info)
@@ -258,7 +260,7 @@ class XopDataset(LeRobotDataset):
                 f"episode {index} lost {facts.dropped_frames} video frames; it is not saved"
             )
         length = self._tally.frames
-        with hold_signals():
+        with hold_signals(), skip_embedding(self):
             super().save_episode(episode_data, parallel_encoding)
             self._own_root = False
             self._secure()

@@ -1,0 +1,190 @@
+"""LeRobot's own commands, and xop-record, from the command line to the data and back.
+
+The commands run in this process, as importing LeRobot's scripts takes ten seconds each time.
+"""
+
+from __future__ import annotations
+
+import importlib
+import signal
+import sys
+from pathlib import Path
+
+import draccus
+import numpy as np
+import pytest
+import toy_robot  # noqa: F401  registers the toy
+from lerobot.datasets import LeRobotDataset
+from lerobot.scripts.lerobot_record import RecordConfig
+
+from xop_lerobot.command import Mode
+from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.dataset.record import XopRecordConfig
+
+REPO = Path(__file__).parents[1]
+ROBOT = ("--robot.type=xop_toy", "--robot.width=64", "--robot.height=48")
+TELEOP = (
+    "--teleop.type=xop",
+    "--teleop.device.path=g1_squat_walk_reach",
+    "--teleop.retargeter.type=direct",
+)
+
+
+def run(monkeypatch, command: str, *flags: str) -> None:
+    """Run `command` with `flags`, and leave no signal handler behind."""
+    name = command.replace("-", "_")
+    module = "xop_lerobot.dataset.record" if name == "xop_record" else f"lerobot.scripts.{name}"
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.setattr(sys, "argv", [command, *flags])
+    try:
+        importlib.import_module(module).main()
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def record_flags(root: Path, **changes: object) -> list[str]:
+    flags = {
+        "repo_id": "local/toy", "root": root, "fps": 25, "num_episodes": 2, "reset_time_s": 0,
+        "episode_time_s": 0.4, "single_task": "play", "push_to_hub": "false",
+        "streaming_encoding": "true", "no_stamp": "true",
+    } | changes  # fmt: skip
+    return [f"--dataset.{key}={value}" for key, value in flags.items()]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """A dataset of two episodes, by stock `lerobot-record`."""
+    root = tmp_path_factory.mktemp("recorded") / "data"
+    with pytest.MonkeyPatch.context() as patch:
+        flags = (*ROBOT, *TELEOP, *record_flags(root), "--play_sounds=false")
+        run(patch, "lerobot-record", *flags)
+    return root
+
+
+@pytest.mark.slow
+def test_lerobot_record(recorded):
+    dataset = LeRobotDataset("local/toy", root=recorded)
+    assert (dataset.num_episodes, len(dataset)) == (2, 20)
+    assert dataset[15]["operator.engaged"].item()
+    assert dataset.meta.robot_type == "xop_toy"
+
+
+@pytest.mark.slow
+def test_xop_record_writes_the_same(recorded, tmp_path, monkeypatch):
+    root = tmp_path / "data"
+    run(monkeypatch, "xop-record", *ROBOT, *TELEOP, *record_flags(root), "--play_sounds=false")
+    ours, theirs = (LeRobotDataset("local/toy", root=path) for path in (root, recorded))
+    assert list(ours.features) == list(theirs.features)
+    for key in ("action", "observation.state", "goal.head", "retargeter.command", "time.sim"):
+        values = [np.stack(each.hf_dataset.with_format("numpy")[key]) for each in (ours, theirs)]
+        assert np.array_equal(*values), key
+
+
+@pytest.mark.slow
+def test_resuming_from_the_command_line(recorded, tmp_path, monkeypatch):
+    root = tmp_path / "data"
+    flags = [*ROBOT, *TELEOP, *record_flags(root, num_episodes=1), "--play_sounds=false"]
+    run(monkeypatch, "lerobot-record", *flags)
+    run(monkeypatch, "lerobot-record", *flags, "--resume=true")
+    assert [row["episode_index"] for row in read_facts(root)] == [0, 1]
+    assert LeRobotDataset("local/toy", root=root).num_episodes == 2
+
+
+@pytest.mark.slow
+def test_lerobot_teleoperate(monkeypatch):
+    run(monkeypatch, "lerobot-teleoperate", *ROBOT, *TELEOP, "--fps=50", "--teleop_time_s=1")
+
+
+@pytest.mark.slow
+def test_lerobot_replay(recorded, monkeypatch):
+    sent = []
+    execute = toy_robot.XopToy.send_action
+    monkeypatch.setattr(
+        toy_robot.XopToy,
+        "send_action",
+        lambda self, action: sent.append(execute(self, action)) or sent[-1],
+    )
+    dataset = ("--dataset.repo_id=local/toy", f"--dataset.root={recorded}", "--dataset.episode=1")
+    run(monkeypatch, "lerobot-replay", *ROBOT, *dataset, "--play_sounds=false")
+    actions = LeRobotDataset("local/toy", root=recorded).hf_dataset[10:]["action"]
+    replayed = np.array([list(action.values()) for action in sent])
+    assert replayed == pytest.approx(np.stack(actions), abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def policy(recorded, tmp_path_factory) -> Path:
+    """ACT after two steps of `lerobot-train`."""
+    pytest.importorskip("accelerate", reason="lerobot-train needs accelerate")
+    out = tmp_path_factory.mktemp("train") / "out"
+    act = {
+        "type": "act", "device": "cpu", "push_to_hub": "false", "use_vae": "false",
+        "pretrained_backbone_weights": "null", "dim_model": 32, "n_heads": 2,
+        "dim_feedforward": 32, "n_encoder_layers": 1, "chunk_size": 5, "n_action_steps": 5,
+    }  # fmt: skip
+    flags = [f"--policy.{key}={value}" for key, value in act.items()]
+    flags += ["--dataset.repo_id=local/toy", f"--dataset.root={recorded}", "--steps=2"]
+    flags += ["--batch_size=2", "--num_workers=0", f"--output_dir={out}", "--save_freq=2"]
+    with pytest.MonkeyPatch.context() as patch:
+        run(patch, "lerobot-train", *flags)
+    return out / "checkpoints" / "last" / "pretrained_model"
+
+
+@pytest.mark.slow
+def test_lerobot_train_takes_state_and_pictures(policy):
+    from lerobot.configs import PreTrainedConfig
+
+    config = PreTrainedConfig.from_pretrained(policy)
+    assert set(config.input_features) == {"observation.state", "observation.images.head"}
+    assert set(config.output_features) == {"action"}
+
+
+@pytest.mark.slow
+def test_lerobot_rollout(policy, tmp_path, monkeypatch):
+    root = tmp_path / "data"
+    flags = [*ROBOT, *TELEOP, f"--policy.path={policy}", "--device=cpu", "--fps=25"]
+    flags += ["--strategy.type=episodic", "--task=play", "--play_sounds=false"]
+    flags += record_flags(root, repo_id="local/rollout_toy", num_episodes=1, episode_time_s=1)
+    run(monkeypatch, "lerobot-rollout", *flags)
+    dataset = LeRobotDataset("local/rollout_toy", root=root)
+    assert dataset.num_episodes == 1
+    assert not any(dataset.hf_dataset["operator.engaged"])
+    assert any(np.ravel(dataset.hf_dataset["robot.head"]))
+
+
+# Mistakes.
+
+
+def test_xop_record_takes_our_types_only(tmp_path, monkeypatch):
+    flags = ("--robot.type=koch_follower", "--robot.port=/dev/null", *TELEOP)
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, "xop-record", *flags, *record_flags(tmp_path / "data"))
+    assert str(stop.value) == (
+        "error: xop-record takes --robot.type=xop_g1 or xop_rby1 and --teleop.type=xop, got "
+        "koch_follower and xop. Use lerobot-record for others"
+    )
+
+
+def test_an_unknown_flag_names_it(tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit):
+        flags = record_flags(tmp_path / "data")
+        run(monkeypatch, "xop-record", *ROBOT, *TELEOP, "--robot.camz=[head]", *flags)
+    assert "camz" in capsys.readouterr().err
+
+
+def test_a_mistake_is_one_line(tmp_path, monkeypatch):
+    flags = record_flags(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        run(monkeypatch, "xop-record", *ROBOT, *TELEOP, *flags)
+    assert str(stop.value).startswith(f"error: dataset directory '{tmp_path}' exists already.")
+
+
+@pytest.mark.parametrize("robot", ["g1", "rby1"])
+@pytest.mark.parametrize("config_class", [RecordConfig, XopRecordConfig])
+def test_configs_that_are_shipped(robot, config_class):
+    path = REPO / "configs" / f"record_{robot}.yaml"
+    config = draccus.parse(config_class, config_path=path, args=[])
+    assert config.robot.type == f"xop_{robot}"
+    assert config.robot.fps == config.dataset.fps
+    assert config.dataset.rgb_encoder.vcodec == "h264"
+    assert config.teleop.device.start_mode is Mode.STATIONARY
