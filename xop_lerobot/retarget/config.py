@@ -38,7 +38,7 @@ class CostWeights:
     control: float = 0.002
     terminal: float = 2.0
     fall: float = 100.0
-    support: float = 30.0
+    support: float = 1000.0
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ class ProposalWeights:
     position: tuple[float, float, float] = (1.0, 1.0, 1.0)
     orientation: tuple[float, float, float] = (0.4, 0.4, 0.4)
     effort: float = 0.02
-    support: float = 10.0
+    support: float = 30.0
 
 
 class KinematicProposal:

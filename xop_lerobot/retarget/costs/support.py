@@ -18,7 +18,7 @@ class SupportArea:
         margin: Distance that is kept from every edge [m].
     """
 
-    def __init__(self, corners: tuple[tuple[float, float], ...], margin: float = 0.06) -> None:
+    def __init__(self, corners: tuple[tuple[float, float], ...], margin: float = 0.1) -> None:
         points = np.array(corners, dtype=float)
         edges = np.roll(points, -1, axis=0) - points
         normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)  # outwards
