@@ -1,6 +1,6 @@
-"""Distil FALCON's G1 policy into the student that ships with the package.
+r"""Distil FALCON's G1 policy into the student that ships with the package.
 
-    python scripts/distill_low_level.py --teacher g1_29dof.onnx --seed 0 \\
+    python scripts/distill_low_level.py --teacher g1_29dof.onnx --seed 0 \
         --out xop_lerobot/low_level/weights/g1_student.npz --report student.json
 
 DAgger (Ross et al., 2011): many robots run in the planning model; each is driven by the teacher
@@ -49,7 +49,7 @@ WIDE = ExcitationConfig(
     vy=0.6,
     yaw_rate=1.0,
     arm_range=0.95,
-    arm_speed=3.0,
+    arm_speed=5.0,
     push=0.6,
     push_period=4.0,
     hand_force=15.0,
@@ -290,11 +290,11 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--docs", type=Path, help="Markdown page whose table is to be replaced")
     parser.add_argument("--evaluate-only", action="store_true", help="compare, do not train")
     parser.add_argument("--hidden", type=int, nargs="+", default=[384, 192], help="layer widths")
-    parser.add_argument("--rounds", type=int, default=24, help="rounds of DAgger")
+    parser.add_argument("--rounds", type=int, default=30, help="rounds of DAgger")
     parser.add_argument("--robots", type=int, default=256, help="robots at once")
     parser.add_argument("--steps", type=int, default=150, help="policy steps a round [20 ms]")
     parser.add_argument("--updates", type=int, default=300, help="gradient steps a round")
-    parser.add_argument("--final-updates", type=int, default=8000, help="gradient steps at last")
+    parser.add_argument("--final-updates", type=int, default=10000, help="gradient steps at last")
     parser.add_argument("--batch", type=int, default=1024, help="samples a gradient step")
     parser.add_argument("--trials", type=int, default=200, help="sequences of the comparison")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of a sequence [s]")

@@ -22,7 +22,7 @@ from xop_lerobot.transforms import quat_rotate, quat_yaw
 
 FALL_HEIGHT = 0.35
 """Base height under which a robot counts as fallen [m]."""
-FALL_TILT = 0.9
+FALL_TILT = 0.8
 """Tilt of the base over which a robot counts as fallen [rad]."""
 
 
