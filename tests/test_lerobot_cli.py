@@ -92,6 +92,27 @@ def test_resuming_from_the_command_line(recorded, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("command", ["lerobot-record", "xop-record"])
+def test_real_time(tmp_path, monkeypatch, command):
+    """On the wall clock an episode ends by the wall clock, and says how it went."""
+    root = tmp_path / "data"
+    flags = [*ROBOT, *TELEOP, *record_flags(root, num_episodes=2, episode_time_s=1)]
+    run(monkeypatch, command, *flags, "--robot.clock=realtime", "--play_sounds=false")
+    dataset = LeRobotDataset("local/toy", root=root)
+    episodes = np.array(dataset.hf_dataset["episode_index"])
+    times = np.ravel(dataset.hf_dataset["time.sim"])
+    for facts in read_facts(root):
+        assert facts["clock"] == "realtime"
+        assert facts["length"] <= 26
+        assert facts["late"] == (facts["real_fps"] < 0.95 * 25)
+        stamps = times[episodes == facts["episode_index"]]
+        assert len(stamps) == facts["length"]
+        assert (np.diff(stamps) >= 0).all()
+        # The second in which the robot starts over and settles is not on the episode's time.
+        assert len(stamps) > 1
+
+
+@pytest.mark.slow
 def test_lerobot_teleoperate(monkeypatch):
     run(monkeypatch, "lerobot-teleoperate", *ROBOT, *TELEOP, "--fps=50", "--teleop_time_s=1")
 
@@ -170,6 +191,28 @@ def test_an_unknown_flag_names_it(tmp_path, monkeypatch, capsys):
         flags = record_flags(tmp_path / "data")
         run(monkeypatch, "xop-record", *ROBOT, *TELEOP, "--robot.camz=[head]", *flags)
     assert "camz" in capsys.readouterr().err
+
+
+BAD_FLAGS = {
+    "--robot.fps=30": "robot.fps must divide the low-level policy's 50 Hz, got 30",
+    "--robot.sim.noise=loud": "unknown noise preset 'loud'. Known: harsh, mild, off",
+    "--robot.width=0": "a picture must be at least 1 x 1 pixels, got 0 x 48",
+    "--teleop.device.hold_s=-1": "device.hold_s must be finite and at least 0, got -1.0",
+    "--teleop.device.mode=fly": "unknown device.mode 'fly'. Known: mobile, stationary",
+    "--teleop.retargeter.type=magic": "unknown retargeter 'magic'. Known: direct, mpc",
+    "--teleop.alignment.walk_scale=0": "alignment.walk_scale must be finite and above 0, got 0.0",
+}
+
+
+@pytest.mark.parametrize("flag", BAD_FLAGS)
+@pytest.mark.parametrize("command", ["lerobot-record", "xop-record"])
+def test_a_bad_setting_says_what_is_wrong(tmp_path, monkeypatch, capsys, command, flag):
+    """LeRobot's parser stops at the configuration, long before a robot is made."""
+    robot = [each for each in ROBOT if not each.startswith(flag.split("=")[0])]
+    with pytest.raises(SystemExit):
+        run(monkeypatch, command, *robot, *TELEOP, *record_flags(tmp_path / "data"), flag)
+    assert BAD_FLAGS[flag] in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
 
 
 def test_a_mistake_is_one_line(tmp_path, monkeypatch):

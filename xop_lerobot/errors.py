@@ -40,8 +40,11 @@ class BadShape(XopError, ValueError):
         super().__init__(f"{name} must have shape {expected}, got {actual}")
 
 
-class BadValue(XopError, ValueError):
-    """A value is out of its range or of the wrong kind."""
+class BadValue(XopError):
+    """A value is out of its range or of the wrong kind.
+
+    It is no ValueError on purpose: LeRobot's command line parser hides the text of those.
+    """
 
 
 class BadRecording(XopError, ValueError):

@@ -107,15 +107,20 @@ class XopRobot(Robot):
         del calibrate
         if self.is_connected:
             return
-        from xop_lerobot.plant import policy_loop  # noqa: PLC0415
+        from xop_lerobot.plant.policy_loop import PolicyLoop  # noqa: PLC0415
+        from xop_lerobot.plant.realtime_loop import RealtimeLoop  # noqa: PLC0415
         from xop_lerobot.plant.simulation import Simulation  # noqa: PLC0415
 
         self._plant = Simulation(self.morphology, self.config.make_simulation_config())
-        name = "RealtimeLoop" if self._info.realtime else "PolicyLoop"
-        self._loop = getattr(policy_loop, name)(self.morphology, self._plant, self._policy)
-        self._announce()
-        self._session.take_reset()
-        self._start_episode()
+        try:
+            loop_class = RealtimeLoop if self._info.realtime else PolicyLoop
+            self._loop = loop_class(self.morphology, self._plant, self._policy)
+            self._announce()
+            self._session.take_reset()
+            self._start_episode()
+        except BaseException:
+            self.disconnect()
+            raise
 
     def _start_episode(self) -> None:
         loop = self._connected_loop

@@ -133,6 +133,8 @@ class Host:
                     call["control_time_s"] = math.inf
                 elif dataset is not None:
                     dataset.begin(call["events"], None)
+                    # The robot starts over in an observation: not on the episode's time.
+                    call["robot"].get_observation()
                 if lockstep:
                     with _without_slowness():
                         stock(**call)

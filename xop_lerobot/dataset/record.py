@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from lerobot.configs import parser
 from lerobot.datasets import (
@@ -25,12 +25,14 @@ from lerobot.datasets import (
     create_initial_features,
 )
 from lerobot.processor import make_default_processors
-from lerobot.robots import Robot, make_robot_from_config
+from lerobot.robots import Robot
 from lerobot.scripts.lerobot_record import RecordConfig
-from lerobot.teleoperators import make_teleoperator_from_config
 from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame, combine_feature_dicts
-from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.import_utils import (
+    make_device_from_device_class,
+    register_third_party_plugins,
+)
 from lerobot.utils.keyboard_input import init_keyboard_listener
 from lerobot.utils.robot_utils import precise_sleep
 from lerobot.utils.utils import init_logging, log_say
@@ -109,6 +111,9 @@ class Recording:
         fps, duration = config.dataset.fps, config.dataset.episode_time_s
         limit = None if self.realtime else count_ticks(duration, fps)
         self.dataset.begin(self.events, limit, stop_on_success=config.stop_on_success)
+        if self.realtime:
+            # The robot starts over in an observation: not on the episode's time.
+            self.robot.get_observation()
         start = time.perf_counter()
         while not self.events["exit_early"]:
             tick_start = time.perf_counter()
@@ -146,8 +151,8 @@ def record(config: XopRecordConfig) -> XopDataset:
     """Record episodes of an xop robot with an xop teleoperator."""
     init_logging()
     robot_config, teleop_config = check_types(config)
-    robot = cast("XopRobot", make_robot_from_config(robot_config))
-    teleop = cast("Xop", make_teleoperator_from_config(teleop_config))
+    robot: XopRobot = make_device_from_device_class(robot_config)
+    teleop: Xop = make_device_from_device_class(teleop_config)
     # LeRobot's own loop is not used here, so it needs no help.
     teleop.host.remove()
     with stop_on_sigterm(), show_data(config):
