@@ -31,7 +31,7 @@ from xop_lerobot.retarget.drift import DriftObserver
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.kmppi import Kmppi, compute_effective_samples
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
-from xop_lerobot.retarget.proposal import KinematicProposal
+from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
 from xop_lerobot.state import Goal, RobotState
 from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply, rotation_error
@@ -79,16 +79,23 @@ class MpcRetargeter(Retargeter):
             (*self.sites.values(), *self._points),
             com_of=morphology.base_body if self.support else None,
         )
-        self.proposal = KinematicProposal(
-            self.command_model, self.kinematics, self.sites, support=self.support
-        )
+        self.proposals = {
+            mode: KinematicProposal(
+                self.command_model,
+                self.kinematics,
+                self.sites,
+                make_proposal_weights(each.weights),
+                self.support,
+            )
+            for mode, each in self.configs.items()
+        }
         standing_height = float(morphology.standing_qpos()[2])
         self.costs: tuple[Cost, ...] = (
             TrackingCost(),
             TerminalCost(),
             StanceCost(morphology.contact_groups, morphology.wheeled),
             CollisionCost(obstacles, hull),
-            ControlCost(self.proposal.scale),
+            ControlCost((self.space.high - self.space.low) / 2),
             SupportCost(self.support),
             FallCost(morphology.fall_tilt, morphology.fall_height, standing_height),
         )
@@ -131,7 +138,7 @@ class MpcRetargeter(Retargeter):
         self.drift.update(state.time, state.qpos, state.command, mode is Mode.MOBILE)
         ahead = np.arange(config.horizon + 1) * POLICY_DT
         goals = self._preview(goal, ahead, config)
-        proposal = self.proposal.solve(
+        proposal = self.proposals[mode].solve(
             state.qpos,
             {name: poses[0] for name, poses in self._preview(goal, _at(config.proposal_s), config).items()},
             mode,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.transforms import rotation_error
@@ -31,6 +33,13 @@ class ProposalWeights:
     orientation: tuple[float, float, float] = (0.4, 0.4, 0.4)
     effort: float = 0.02
     support: float = 30.0
+
+
+def make_proposal_weights(weights: CostWeights) -> ProposalWeights:
+    """Weights of the least squares that match those of the tracking cost."""
+    turn = math.sqrt(weights.orientation / weights.position)
+    tilt = turn * math.sqrt(weights.tilt_share)
+    return ProposalWeights(orientation=(tilt, tilt, turn))
 
 
 class KinematicProposal:

@@ -35,7 +35,7 @@ CONFIGS = {
         num_samples=16,
         horizon=10,
         noise_std={"v": 0.2, "yaw_rate": 0.3, **TORSO_NOISE},
-        weights=CostWeights(orientation=0.2),
+        weights=CostWeights(orientation=0.05),
     ),
 }
 
