@@ -1,0 +1,161 @@
+"""Command spaces and actions: bounds, rates, modes, and LeRobot's flat dictionaries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from xop_lerobot.command import (
+    MODE_KEY,
+    ActionLayout,
+    CommandDim,
+    CommandSpace,
+    Mode,
+    RobotAction,
+    check_vector,
+)
+from xop_lerobot.errors import BadShape, BadValue, UnknownName
+
+SPACE = CommandSpace(
+    (
+        CommandDim("height", "height.pos", "m", 0.5, 0.8, 0.75, 0.5),
+        CommandDim("vx", "x.vel", "m/s", -1.0, 1.0, 0.0, 2.0, mobile_only=True),
+    )
+)
+LAYOUT = ActionLayout(SPACE, ("elbow", "gripper"))
+REST = RobotAction(SPACE.neutral, Mode.STATIONARY, np.array([0.2, 0.05]))
+
+wild = st.tuples(*[st.floats(-3, 3)] * 2).map(np.array)
+inside = st.tuples(st.floats(0.5, 0.8), st.floats(-1, 1)).map(np.array)
+modes = st.sampled_from(list(Mode))
+periods = st.sampled_from([0.02, 0.04, 0.1])
+
+
+# -- limits --------------------------------------------------------------------------------
+
+
+@given(wild, inside, periods, modes)
+def test_limiting_twice_is_limiting_once(command, previous, dt, mode):
+    once = SPACE.limit(command, previous, dt, mode)
+    np.testing.assert_array_equal(SPACE.limit(once, previous, dt, mode), once)
+
+
+@given(wild, inside, periods, modes)
+def test_limits_hold(command, previous, dt, mode):
+    limited = SPACE.limit(command, previous, dt, mode)
+    assert (limited >= SPACE.low).all()
+    assert (limited <= SPACE.high).all()
+    assert (np.abs(limited - previous) <= SPACE.max_rate * dt + 1e-12).all()
+
+
+@given(inside, periods)
+def test_what_is_allowed_is_left_alone(command, dt):
+    np.testing.assert_array_equal(SPACE.limit(command, command, dt, Mode.MOBILE), command)
+    np.testing.assert_array_equal(SPACE.limit(command, None, dt, Mode.MOBILE), command)
+
+
+def test_mobile_entries_go_to_neutral_at_their_rate_in_stationary_mode():
+    walking = np.array([0.7, 1.0])
+    first = SPACE.limit(walking, walking, 0.1, Mode.STATIONARY)
+    np.testing.assert_allclose(first, [0.7, 0.8])
+    command = walking
+    for _ in range(5):
+        command = SPACE.limit(walking, command, 0.1, Mode.STATIONARY)
+    np.testing.assert_allclose(command, [0.7, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(SPACE.limit(walking, None, 0.1, Mode.STATIONARY), [0.7, 0.0])
+
+
+def test_a_previous_command_out_of_bounds_is_left_at_its_rate():
+    np.testing.assert_allclose(
+        SPACE.limit(np.array([0.75, 0]), np.array([1.0, 0]), 0.1, Mode.MOBILE), [0.95, 0.0]
+    )
+
+
+@pytest.mark.parametrize(
+    "command, error, text",
+    [
+        (np.zeros(3), BadShape, "command must have shape (2,), got (3,)"),
+        (np.zeros((1, 2)), BadShape, "command must have shape (2,), got (1, 2)"),
+        ([0.7, np.nan], BadValue, "command must be finite, got [0.7 nan]"),
+        ([0.7, np.inf], BadValue, "command must be finite, got [0.7 inf]"),
+    ],
+)
+def test_bad_commands_are_refused(command, error, text):
+    with pytest.raises(error) as caught:
+        SPACE.limit(command, None, 0.02, Mode.MOBILE)
+    assert str(caught.value) == text
+
+
+def test_check_vector_makes_floats():
+    assert check_vector("ints", [1, 2], 2).dtype == float
+
+
+def test_columns_follow_the_order_and_are_read_only():
+    assert SPACE.names == ("height", "vx")
+    assert SPACE.keys == ("height.pos", "x.vel")
+    assert SPACE.index("vx") == 1
+    np.testing.assert_array_equal(SPACE.mobile_only, [False, True])
+    for column in (SPACE.low, SPACE.high, SPACE.neutral, SPACE.max_rate, SPACE.mobile_only):
+        with pytest.raises(ValueError, match="read-only"):
+            column[0] = 0
+
+
+def test_an_unknown_entry_lists_the_known_ones():
+    with pytest.raises(UnknownName) as caught:
+        SPACE.index("vy")
+    assert str(caught.value) == "unknown command 'vy'. Known: height, vx"
+
+
+# -- the flat dictionary -------------------------------------------------------------------
+
+
+@given(inside, modes, st.tuples(*[st.floats(-2, 2)] * 2).map(np.array))
+def test_round_trip(command, mode, arms):
+    action = RobotAction(command, mode, arms)
+    flat = LAYOUT.to_dict(action)
+    assert tuple(flat) == LAYOUT.keys
+    assert all(type(value) is float for value in flat.values())
+    back = LAYOUT.from_dict(flat, REST)
+    np.testing.assert_array_equal(back.command, command)
+    np.testing.assert_array_equal(back.arms, arms)
+    assert back.mode is mode
+
+
+def test_keys_are_commands_then_mode_then_arms():
+    assert LAYOUT.keys == ("height.pos", "x.vel", "mode.pos", "elbow.pos", "gripper.pos")
+
+
+def test_what_is_absent_stays_as_it_was():
+    previous = RobotAction(np.array([0.6, 0.3]), Mode.MOBILE, np.array([1.0, 0.01]))
+    action = LAYOUT.from_dict({"elbow.pos": -0.5}, previous)
+    np.testing.assert_array_equal(action.command, [0.6, 0.3])
+    np.testing.assert_array_equal(action.arms, [-0.5, 0.01])
+    assert action.mode is Mode.MOBILE
+
+
+@pytest.mark.parametrize(
+    "value, mode",
+    [(0, Mode.STATIONARY), (0.49, Mode.STATIONARY), (0.5, Mode.MOBILE), (1.3, Mode.MOBILE)],
+)
+def test_the_mode_is_the_nearer_of_the_two(value, mode):
+    """A learned policy predicts any number between."""
+    assert LAYOUT.from_dict({MODE_KEY: value}, REST).mode is mode
+
+
+def test_an_unknown_key_lists_the_known_ones():
+    with pytest.raises(UnknownName) as caught:
+        LAYOUT.from_dict({"heigth.pos": 0.7}, REST)
+    assert str(caught.value) == (
+        "unknown action key 'heigth.pos'. "
+        "Known: elbow.pos, gripper.pos, height.pos, mode.pos, x.vel"
+    )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("key", ["x.vel", "mode.pos", "elbow.pos"])
+def test_a_value_that_is_not_finite_is_refused(key, value):
+    with pytest.raises(BadValue) as caught:
+        LAYOUT.from_dict({key: value}, REST)
+    assert str(caught.value) == f"action '{key}' must be finite, got {value}"
