@@ -1,0 +1,497 @@
+"""Cost terms: each against a slow reference with plain loops, and on cases made by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from xop_lerobot.command import Mode
+from xop_lerobot.retarget.config import CostWeights
+from xop_lerobot.retarget.costs import (
+    CollisionCost,
+    ControlCost,
+    Evaluation,
+    FallCost,
+    StanceCost,
+    SupportArea,
+    SupportCost,
+    TerminalCost,
+    TrackingCost,
+)
+from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
+from xop_lerobot.transforms import (
+    make_pose,
+    quat_exp,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    rotation_error,
+)
+
+K, H, NQ, NV, NA = 5, 4, 9, 8, 3
+SITES = ("a", "b", "c")
+WEIGHTS = CostWeights(position=1.3, orientation=0.4, tilt_share=0.3)
+DT = 0.02
+SQUARE = ((0.3, -0.2), (0.3, 0.2), (-0.3, 0.2), (-0.3, -0.2))
+
+
+def draw_poses(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return make_pose(rng.normal(size=(*shape, 3)), quat_exp(rng.normal(size=(*shape, 3))))
+
+
+def make_evaluation(seed: int = 0, **fields) -> Evaluation:
+    """A batch of random predictions."""
+    rng = np.random.default_rng(seed)
+    qpos, terminal_qpos = rng.normal(size=(K, H + 1, NQ)), rng.normal(size=(K, NQ))
+    qpos[..., :7], terminal_qpos[:, :7] = draw_poses(rng, K, H + 1), draw_poses(rng, K)
+    values = {
+        "qpos": qpos,
+        "qvel": rng.normal(size=(K, H + 1, NV)),
+        "commands": rng.normal(size=(K, H, NA)),
+        "reference": rng.normal(size=NA),
+        "poses": {name: draw_poses(rng, K, H + 1) for name in ("head", "left_wrist")},
+        "points": {site: rng.normal(size=(K, H + 1, 3)) for site in SITES},
+        "com": rng.normal(size=(K, H + 1, 3)),
+        "terminal_qpos": terminal_qpos,
+        "terminal_com": rng.normal(size=(K, 3)),
+        "goals": {name: draw_poses(rng, H + 1) for name in ("head", "left_wrist")},
+        "terminal_poses": {name: draw_poses(rng, K) for name in ("head", "left_wrist")},
+        "terminal_goals": {name: draw_poses(rng) for name in ("head", "left_wrist")},
+        "mode": Mode.STATIONARY,
+        "dt": DT,
+        "weights": WEIGHTS,
+    }
+    return Evaluation(**(values | fields))
+
+
+# -- tracking and terminal -----------------------------------------------------------------
+
+
+def compute_pose_cost(pose: np.ndarray, goal: np.ndarray, w: CostWeights) -> float:
+    position = sum((pose[i] - goal[i]) ** 2 for i in range(3))
+    x, y, z = rotation_error(goal[3:], pose[3:])
+    return w.position * position + w.orientation * (z * z + w.tilt_share * (x * x + y * y))
+
+
+def test_tracking_equals_its_formula():
+    e = make_evaluation()
+    expected = [
+        sum(
+            compute_pose_cost(e.poses[name][i, k], e.goals[name][k], WEIGHTS)
+            for name in e.goals
+            for k in range(1, H + 1)
+        )
+        / H
+        for i in range(K)
+    ]
+    np.testing.assert_allclose(TrackingCost().compute(e), expected)
+
+
+def test_terminal_equals_its_formula():
+    e = make_evaluation()
+    expected = [
+        WEIGHTS.terminal
+        * sum(
+            compute_pose_cost(e.terminal_poses[name][i], e.terminal_goals[name], WEIGHTS)
+            for name in e.terminal_goals
+        )
+        for i in range(K)
+    ]
+    np.testing.assert_allclose(TerminalCost().compute(e), expected)
+
+
+def test_tracking_by_hand():
+    """0.1 m off in position all along costs 0.01; the start, which nothing can change, nothing."""
+    goal = make_pose([1.0, 0, 1.2], quat_from_yaw(0.3))
+    poses = np.tile(goal, (1, H + 1, 1))
+    poses[:, 1:, 1] += 0.1
+    poses[:, 0, :3] += 100
+    e = make_evaluation(
+        poses={"head": poses}, goals={"head": np.tile(goal, (H + 1, 1))}, weights=CostWeights()
+    )
+    e = dataclasses.replace(e, qpos=e.qpos[:1])
+    np.testing.assert_allclose(TrackingCost().compute(e), [0.01])
+
+
+@pytest.mark.parametrize("axis, share", [(0, 0.3), (1, 0.3), (2, 1.0)])
+def test_a_tilt_counts_less_than_a_turn(axis, share):
+    goal = make_pose([0, 0, 1], quat_from_yaw(0.8))
+    turn = quat_exp(0.2 * np.eye(3)[axis])
+    pose = make_pose([0, 0, 1], quat_multiply(turn, goal[3:]))
+    e = make_evaluation(terminal_poses={"head": pose[None]}, terminal_goals={"head": goal})
+    e = dataclasses.replace(e, qpos=e.qpos[:1])
+    expected = WEIGHTS.terminal * WEIGHTS.orientation * share * 0.2**2
+    np.testing.assert_allclose(TerminalCost().compute(e), [expected])
+
+
+def test_without_goals_tracking_is_free():
+    e = make_evaluation(goals={}, terminal_goals={})
+    np.testing.assert_array_equal(TrackingCost().compute(e), np.zeros(K))
+    np.testing.assert_array_equal(TerminalCost().compute(e), np.zeros(K))
+
+
+# -- stance --------------------------------------------------------------------------------
+
+
+def compute_stance_slowly(e: Evaluation, groups: tuple[tuple[str, ...], ...]) -> list[float]:
+    totals = []
+    for i in range(K):
+        total = 0.0
+        for k in range(1, H + 1):
+            speeds, heights = [], []
+            for group in groups:
+                squares = [
+                    sum(((e.points[s][i, k, j] - e.points[s][i, k - 1, j]) / DT) ** 2 for j in range(3))
+                    for s in group
+                ]
+                speeds.append(sum(squares) / len(group))
+                heights.append(sum(e.points[s][i, k, 2] for s in group) / len(group))
+            if e.mode is Mode.STATIONARY:
+                total += sum(speeds)
+            else:
+                total += speeds[heights.index(min(heights))]
+        totals.append(WEIGHTS.stance * total / H)
+    return totals
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+@pytest.mark.parametrize(
+    "groups",
+    [
+        (("a",), ("b",)),
+        (("a", "b"), ("b", "c")),
+        (("a", "b", "c"),),
+        pytest.param(
+            (("a", "b"), ("c",)),
+            marks=pytest.mark.xfail(strict=True, reason="groups must be of one size"),
+        ),
+    ],
+)
+def test_stance_equals_its_formula(mode, groups):
+    e = make_evaluation(mode=mode)
+    cost = StanceCost(groups, wheeled=False).compute(e)
+    np.testing.assert_allclose(cost, compute_stance_slowly(e, groups))
+
+
+def test_in_mobile_mode_the_swinging_foot_is_free():
+    still = np.zeros((1, H + 1, 3))
+    swinging = still.copy()
+    swinging[0, :, 0] = np.arange(H + 1) * DT  # 1 m/s
+    swinging[..., 2] = 0.05
+    points = {"a": still, "b": swinging}
+    e = make_evaluation(points=points, mode=Mode.MOBILE)
+    cost = StanceCost((("a",), ("b",)), wheeled=False)
+    np.testing.assert_array_equal(cost.compute(e), [0])
+    standing = dataclasses.replace(e, mode=Mode.STATIONARY)
+    np.testing.assert_allclose(cost.compute(standing), [WEIGHTS.stance])
+
+
+def test_wheels_may_roll_in_mobile_mode_only():
+    cost = StanceCost((("a",), ("b",)), wheeled=True)
+    np.testing.assert_array_equal(cost.compute(make_evaluation(mode=Mode.MOBILE)), np.zeros(K))
+    assert (cost.compute(make_evaluation(mode=Mode.STATIONARY)) > 0).all()
+
+
+# -- collision -----------------------------------------------------------------------------
+
+BOX = Obstacle("box", np.array([0.5, -0.2, 0.4]), quat_from_rpy(0.2, 0.4, 0.9), np.array([0.3, 0.1, 0.2]))
+
+
+@given(st.tuples(*[st.floats(-1.5, 1.5)] * 3).map(np.array))
+def test_distance_to_a_box_equals_brute_force(point):
+    """The nearest of many points of the surface, in the box's own frame."""
+    surface = sample_surface(BOX.half_size, 25)
+    world = BOX.position + quat_rotate(BOX.quat, surface)
+    nearest = np.linalg.norm(world - point, axis=1).min()
+    distance = BOX.compute_distance(point)
+    assert abs(abs(distance) - nearest) < 0.02  # the spacing of the points
+
+
+def sample_surface(half: np.ndarray, count: int) -> np.ndarray:
+    grid = np.linspace(-1, 1, count)
+    u, v = (g.ravel() for g in np.meshgrid(grid, grid))
+    faces = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            face = np.stack([u, v], axis=1)
+            faces.append(np.insert(face, axis, sign, axis=1))
+    return np.concatenate(faces) * half
+
+
+@pytest.mark.parametrize(
+    "local, distance",
+    [
+        ([0.4, 0, 0], 0.1),  # beside a face
+        ([0.3, 0, 0], 0.0),  # on it
+        ([0.3 + 0.3, 0.1 + 0.4, 0], 0.5),  # over an edge, 3-4-5
+        ([0, 0, 0], -0.1),  # in the middle, to the nearest face
+        ([0.29, 0, 0], -0.01),
+    ],
+)
+def test_distance_to_a_box_by_hand(local, distance):
+    point = BOX.position + quat_rotate(BOX.quat, np.array(local))
+    assert BOX.compute_distance(point) == pytest.approx(distance, abs=1e-12)
+
+
+def test_distance_equals_mujocos():
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom name='box' type='box' pos='.5 -.2 .4' size='.3 .1 .2' "
+        "euler='10 20 30'/><body name='ball'><freejoint/><geom name='ball' size='.05'/></body>"
+        "</worldbody></mujoco>"
+    )
+    (box,) = make_obstacles(model)
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for _ in range(50):
+        data.qpos[:3] = rng.uniform(-1, 1.5, 3)
+        mujoco.mj_kinematics(model, data)
+        expected = mujoco.mj_geomDistance(model, data, 0, 1, 10.0, None)
+        got = box.compute_distance(data.qpos[:3]) - 0.05
+        if expected > 0:  # depths are measured along other directions there
+            assert got == pytest.approx(expected, abs=1e-6)
+
+
+def test_obstacles_are_what_is_fixed_and_collides():
+    model = mujoco.MjModel.from_xml_string("""
+<mujoco><worldbody>
+  <geom name="floor" type="plane" size="5 5 1"/>
+  <geom name="wall" type="box" size="0.1 2 1" pos="3 0 1"/>
+  <geom name="picture" type="box" size="0.1 1 1" pos="2 0 1" contype="0" conaffinity="0"/>
+  <body pos="0 1 0.5" euler="0 0 90"><geom name="post" type="cylinder" size="0.1 0.5"/>
+    <body pos="0 0 0.6"><geom name="rail" type="capsule" size="0.05" fromto="0 0 0 1 0 0"/></body>
+  </body>
+  <body name="door"><joint axis="0 0 1"/><geom name="door" type="box" size="0.5 0.05 1"/></body>
+</worldbody></mujoco>""")
+    obstacles = {obstacle.name: obstacle for obstacle in make_obstacles(model)}
+    assert set(obstacles) == {"wall", "post", "rail"}
+    np.testing.assert_allclose(obstacles["wall"].position, [3, 0, 1])
+    np.testing.assert_allclose(obstacles["post"].half_size, [0.1, 0.1, 0.5])
+    # The rail leads along the world's Y from the post, 1 m and two caps long.
+    rail = obstacles["rail"]
+    np.testing.assert_allclose(rail.position, [0, 1.5, 1.1], atol=1e-9)
+    assert rail.compute_distance(np.array([0, 2.15, 1.1])) == pytest.approx(0.1)
+    assert rail.compute_distance(np.array([0.15, 1.5, 1.1])) == pytest.approx(0.1)
+
+
+def test_collision_equals_its_formula():
+    wall = Obstacle("wall", np.array([0.0, 2, 0]), np.array([1.0, 0, 0, 0]), np.array([3.0, 0.1, 3]))
+    radii = {"a": 0.1, "b": 0.2}
+    e = make_evaluation(weights=CostWeights(collision=0.7, collision_velocity=1.9))
+    alpha, beta = 4.0, 6.0
+    expected = []
+    for i in range(K):
+        total = 0.0
+        for k in range(1, H + 1):
+            speed = e.qvel[i, k, 0] ** 2 + e.qvel[i, k, 1] ** 2
+            for box in (BOX, wall):
+                d = min(box.compute_distance(e.points[s][i, k]) - r for s, r in radii.items())
+                if d < 1:
+                    total += 0.7 * (math.exp(-alpha * d) - math.exp(-alpha))
+                    total += 1.9 * speed * (math.exp(-beta * d) - math.exp(-beta))
+        expected.append(total / H)
+    cost = CollisionCost((BOX, wall), radii, alpha, beta)
+    np.testing.assert_allclose(cost.compute(e), expected)
+
+
+def test_collision_is_nothing_far_away_and_grows_on_approach():
+    cost = CollisionCost((BOX,), {"a": 0.1})
+    costs = []
+    for distance in (1.2, 1.0, 0.5, 0.2, 0.0):
+        place = BOX.position + quat_rotate(BOX.quat, np.array([0.3 + 0.1 + distance, 0, 0]))
+        points = {"a": np.tile(place, (1, H + 1, 1))}
+        costs.append(cost.compute(make_evaluation(points=points, qvel=np.zeros((1, H + 1, NV))))[0])
+    assert costs[0] == 0
+    assert costs[1] == pytest.approx(0, abs=1e-12)
+    assert (np.diff(costs[1:]) > 0).all()
+    assert costs[-1] == pytest.approx(1, abs=1e-3)
+
+
+def test_without_obstacles_collision_is_free():
+    np.testing.assert_array_equal(CollisionCost((), {"a": 1.0}).compute(make_evaluation()), 0)
+    np.testing.assert_array_equal(CollisionCost((BOX,), {}).compute(make_evaluation()), 0)
+
+
+# -- control -------------------------------------------------------------------------------
+
+
+def test_control_equals_its_formula():
+    e, scale = make_evaluation(), np.array([0.1, 1.0, 2.0])
+    expected = [
+        WEIGHTS.control
+        * sum(
+            ((e.commands[i, k, j] - e.reference[j]) / scale[j]) ** 2
+            for k in range(H)
+            for j in range(NA)
+        )
+        / H
+        for i in range(K)
+    ]
+    np.testing.assert_allclose(ControlCost(scale).compute(e), expected)
+
+
+def test_the_reference_costs_nothing():
+    e = make_evaluation(commands=np.tile([0.75, 0.3, 0.1], (K, H, 1)), reference=[0.75, 0.3, 0.1])
+    np.testing.assert_array_equal(ControlCost(np.ones(NA)).compute(e), np.zeros(K))
+
+
+# -- support -------------------------------------------------------------------------------
+
+
+def base_at(x: float, y: float, yaw: float) -> np.ndarray:
+    return make_pose([x, y, 0.4], quat_from_yaw(yaw))
+
+
+@pytest.mark.parametrize(
+    "point, excess",
+    [
+        ((0, 0), (0, 0, 0, 0)),
+        ((0.2, 0.1), (0, 0, 0, 0)),
+        ((0.3, 0), (0.05, 0, 0, 0)),
+        ((0, -0.25), (0, 0, 0, 0.1)),
+        ((-0.35, 0.3), (0, 0.15, 0.1, 0)),
+    ],
+)
+@pytest.mark.parametrize("base", [(0, 0, 0), (2, -1, 0.7), (0, 0, -2.5)])
+def test_excess_over_each_edge_by_hand(point, excess, base):
+    """Edges in the order of the corners: front, left, back, right; shrunk by 5 cm."""
+    pose = base_at(*base)
+    world = pose[:2] + quat_rotate(pose[3:], np.array([*point, 0]))[:2]
+    got = SupportArea(SQUARE, margin=0.05).compute_excess(pose, world)
+    np.testing.assert_allclose(got, excess, atol=1e-12)
+
+
+def test_excess_does_not_change_when_the_base_tilts_forward():
+    """Only place and heading of the base count: the area lies on the ground."""
+    tilted = make_pose([1, 2, 0.4], quat_from_rpy(0.0, 0.3, 0.5))
+    level = make_pose([1, 2, 0.4], quat_from_yaw(0.5))
+    area, point = SupportArea(SQUARE), np.array([1.5, 2.1])
+    np.testing.assert_allclose(
+        area.compute_excess(tilted, point), area.compute_excess(level, point)
+    )
+
+
+def test_support_equals_its_formula():
+    area, g = SupportArea(SQUARE, margin=0.05), 9.81
+    e = make_evaluation()
+    expected = []
+    for i in range(K):
+        first = (e.com[i, 1, :2] - e.com[i, 0, :2]) / DT
+        last = (e.com[i, H, :2] - e.com[i, H - 1, :2]) / DT
+        acceleration = (last - first) / ((H - 1) * DT)
+        total = 0.0
+        for k in range(H + 1):
+            zmp = e.com[i, k, :2] - e.com[i, k, 2] / g * acceleration
+            total += sum(area.compute_excess(e.qpos[i, k, :7], zmp) ** 2) / (H + 1)
+        total += sum(area.compute_excess(e.terminal_qpos[i, :7], e.terminal_com[i, :2]) ** 2)
+        expected.append(WEIGHTS.support * total)
+    np.testing.assert_allclose(SupportCost(area).compute(e), expected)
+
+
+@pytest.mark.parametrize("acceleration, tips", [(0.0, False), (2.0, False), (4.0, True)])
+def test_braking_hard_tips_the_robot(acceleration, tips):
+    """A centre of mass 1 m up over the middle: tipping begins at g times 0.25 m / 1 m."""
+    times = np.arange(H + 1) * DT
+    com = np.zeros((1, H + 1, 3))
+    com[0, :, 0], com[..., 2] = 0.5 * acceleration * times**2, 1.0
+    e = make_evaluation(
+        com=com,
+        qpos=np.tile(base_at(0, 0, 0), (1, H + 1, 1)),
+        terminal_com=np.array([[0.0, 0, 1]]),
+        terminal_qpos=base_at(0, 0, 0)[None],
+    )
+    (cost,) = SupportCost(SupportArea(SQUARE, margin=0.05)).compute(e)
+    assert (cost > 0) == tips
+
+
+def test_a_horizon_of_one_step_has_no_acceleration():
+    e = make_evaluation(com=np.zeros((K, 2, 3)), qpos=np.tile(base_at(0, 0, 0), (K, 2, 1)))
+    assert np.isfinite(SupportCost(SupportArea(SQUARE)).compute(e)).all()
+
+
+def test_a_robot_that_balances_itself_has_no_support_cost():
+    np.testing.assert_array_equal(SupportCost(None).compute(make_evaluation()), np.zeros(K))
+
+
+# -- fall ----------------------------------------------------------------------------------
+
+
+def evaluate_fall(pose: np.ndarray) -> float:
+    e = make_evaluation(qpos=np.tile(pose, (1, H + 1, 1)), weights=CostWeights(fall=10.0))
+    return FallCost(tilt=0.8, height=0.35, standing_height=0.75).compute(e)[0]
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_fall_counts_tilt_beyond_half_the_limit(yaw):
+    for roll, pitch in ((0, 0), (0.39, 0), (0, -0.39)):
+        quat = quat_multiply(quat_from_yaw(yaw), quat_from_rpy(roll, pitch, 0))
+        assert evaluate_fall(make_pose([0, 0, 0.75], quat)) == 0
+    quat = quat_multiply(quat_from_yaw(yaw), quat_from_rpy(0, 0.6, 0))
+    assert evaluate_fall(make_pose([0, 0, 0.75], quat)) == pytest.approx(10 * 0.2**2)
+
+
+def test_fall_counts_height_under_the_last_quarter():
+    upright = np.array([1.0, 0, 0, 0])
+    assert evaluate_fall(make_pose([0, 0, 0.46], upright)) == 0
+    assert evaluate_fall(make_pose([0, 0, 0.35], upright)) == pytest.approx(10 * 0.1**2)
+
+
+def test_fall_does_not_count_the_start():
+    e = make_evaluation(qpos=np.tile(make_pose([0, 0, 0.75], [1, 0, 0, 0]), (1, H + 1, 1)))
+    e.qpos[:, 0, 2] = -5
+    np.testing.assert_array_equal(FallCost(0.8, 0.35, 0.75).compute(e), [0])
+
+
+# -- all of them ---------------------------------------------------------------------------
+
+ALL = (
+    TrackingCost(),
+    TerminalCost(),
+    StanceCost((("a",), ("b",)), wheeled=False),
+    CollisionCost((BOX,), {"a": 0.1}),
+    ControlCost(np.ones(NA)),
+    SupportCost(SupportArea(SQUARE)),
+    FallCost(0.8, 0.35, 0.75),
+)
+
+
+@pytest.mark.parametrize("cost", ALL, ids=lambda cost: cost.name)
+def test_costs_are_finite_positive_and_proportional_to_their_weight(cost):
+    value = cost.compute(make_evaluation())
+    assert value.shape == (K,)
+    assert (value >= 0).all()
+    assert (value > 0).any()
+    doubled = {f.name: 2 * getattr(WEIGHTS, f.name) for f in dataclasses.fields(CostWeights)}
+    # The terminal weight is a factor on the tracking weights, tilt_share one on a part of them.
+    keep = {"tilt_share": WEIGHTS.tilt_share, "terminal": WEIGHTS.terminal}
+    weights = CostWeights(**(doubled | keep))
+    np.testing.assert_allclose(cost.compute(make_evaluation(weights=weights)), 2 * value)
+    nothing = CostWeights(**{name: 0.0 for name in doubled})
+    np.testing.assert_array_equal(cost.compute(make_evaluation(weights=nothing)), np.zeros(K))
+
+
+def test_every_term_has_its_own_name():
+    assert len({cost.name for cost in ALL}) == len(ALL)
+
+
+@pytest.mark.parametrize("cost", ALL, ids=lambda cost: cost.name)
+def test_a_sample_costs_the_same_alone(cost):
+    """No term may mix samples."""
+    e = make_evaluation()
+    alone = dataclasses.replace(
+        e,
+        **{
+            name: getattr(e, name)[2:3]
+            for name in ("qpos", "qvel", "commands", "com", "terminal_qpos", "terminal_com")
+        },
+        **{
+            name: {key: value[2:3] for key, value in getattr(e, name).items()}
+            for name in ("poses", "points", "terminal_poses")
+        },
+    )
+    np.testing.assert_allclose(cost.compute(alone), cost.compute(e)[2:3])

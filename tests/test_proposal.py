@@ -1,0 +1,386 @@
+"""The kinematic proposal and the command model it inverts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from xop_lerobot.command import Mode
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.costs import SupportArea
+from xop_lerobot.retarget.direct import DirectRetargeter
+from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights, _solve_in_box
+from xop_lerobot.state import Goal, RobotState
+from xop_lerobot.transforms import (
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    quat_yaw,
+    rotation_error,
+)
+
+ROBOTS = ("g1", "rby1")
+DT = 0.6
+robots = pytest.mark.parametrize("name", ROBOTS)
+modes = pytest.mark.parametrize("mode", list(Mode))
+
+
+class Parts:
+    """A robot and its proposal."""
+
+    def __init__(self, name: str) -> None:
+        self.morphology = make_morphology(name)
+        self.model = self.morphology.build_spec("planning").compile()
+        self.space = self.morphology.command_space
+        self.qpos = self.morphology.standing_qpos()
+        self.command_model = CommandModel(
+            self.model, self.space, self.morphology.effects, self.morphology.pivot
+        )
+        self.head = self.morphology.frames["head"]
+        self.kinematics = SiteKinematics(self.model, (self.head,), self.morphology.base_body)
+        self.proposal = self.make()
+
+    def make(self, **settings) -> KinematicProposal:
+        return KinematicProposal(
+            self.command_model, self.kinematics, {"head": self.head}, **settings
+        )
+
+    def reach(self, command: np.ndarray, mode: Mode, dt: float = DT, drift=None) -> np.ndarray:
+        """Where the head of an ideal robot is after `dt` of a command."""
+        future = self.command_model.extrapolate(self.qpos, command, dt, mode, drift)
+        return self.kinematics.compute_poses(future)[self.head]
+
+    def draw(self, rng: np.random.Generator, mode: Mode, share: float = 0.3) -> np.ndarray:
+        """A command around neutral, within the bounds, that acts in `mode`."""
+        scale = share * (self.space.high - self.space.low) / 2
+        command = self.space.neutral + scale * rng.uniform(-1, 1, len(self.space))
+        command = np.clip(command, self.space.low, self.space.high)
+        return np.where(self.command_model.acting(mode), command, self.space.neutral)
+
+
+@pytest.fixture(scope="module")
+def parts() -> dict[str, Parts]:
+    return {name: Parts(name) for name in ROBOTS}
+
+
+def measure_error(pose: np.ndarray, goal: np.ndarray) -> tuple[float, float]:
+    turn = rotation_error(goal[3:], pose[3:])
+    return float(np.linalg.norm(pose[:3] - goal[:3])), float(np.linalg.norm(turn))
+
+
+# -- the command model ---------------------------------------------------------------------
+
+
+def test_the_base_moves_along_the_arc_of_its_twist(parts):
+    """Slow twin: the twist integrated in small steps."""
+    model, qpos = parts["g1"].command_model, parts["g1"].qpos.copy()
+    qpos[3:7] = quat_from_yaw(0.7)
+    command = parts["g1"].space.neutral.copy()
+    command[-3:] = 0.5, -0.2, 0.8
+    x, y, yaw, steps = qpos[0], qpos[1], 0.7, 2000
+    for _ in range(steps):
+        x += (0.5 * np.cos(yaw) + 0.2 * np.sin(yaw)) * DT / steps
+        y += (0.5 * np.sin(yaw) - 0.2 * np.cos(yaw)) * DT / steps
+        yaw += 0.8 * DT / steps
+    got = model.extrapolate(qpos, command, DT, Mode.MOBILE)
+    np.testing.assert_allclose(got[:2], [x, y], atol=0.005)
+    assert quat_yaw(got[3:7]) == pytest.approx(yaw)
+
+
+def test_a_pivot_ahead_of_the_base_stays_where_it_is(parts):
+    rby1 = parts["rby1"]
+    command = rby1.space.neutral.copy()
+    command[rby1.space.index("yaw_rate")] = 1.0
+    qpos = rby1.qpos.copy()
+    qpos[3:7] = quat_from_yaw(-1.1)
+
+    def axle(q: np.ndarray) -> np.ndarray:
+        return q[:3] + quat_rotate(q[3:7], np.array([rby1.morphology.pivot, 0, 0]))
+
+    got = rby1.command_model.extrapolate(qpos, command, 0.8, Mode.MOBILE)
+    np.testing.assert_allclose(axle(got), axle(qpos), atol=1e-12)
+    assert quat_yaw(got[3:7]) == pytest.approx(-0.3)
+
+
+@robots
+@modes
+def test_heights_and_joints_follow_with_their_lag(parts, name, mode):
+    p = parts[name]
+    command = p.draw(np.random.default_rng(0), mode)
+    got = p.command_model.extrapolate(p.qpos, command, 0.2, mode)
+    for i, effect in enumerate(p.morphology.effects):
+        if p.command_model.is_velocity()[i] or not p.command_model.acting(mode)[i]:
+            continue
+        address = 2 if not effect.joint else int(p.model.joint(effect.joint).qposadr[0])
+        expected = command[i] + (p.qpos[address] - command[i]) * np.exp(-0.2 / effect.lag_s)
+        assert got[address] == pytest.approx(expected)
+
+
+@robots
+def test_the_neutral_command_leaves_place_and_heading_alone(parts, name):
+    p = parts[name]
+    got = p.command_model.extrapolate(p.qpos, p.space.neutral, 2.0, Mode.MOBILE)
+    np.testing.assert_allclose(got[:2], p.qpos[:2], atol=1e-12)
+    np.testing.assert_allclose(got[3:7], p.qpos[3:7], atol=1e-12)
+
+
+@robots
+@modes
+def test_a_batch_equals_one_at_a_time(parts, name, mode):
+    p, rng = parts[name], np.random.default_rng(1)
+    commands = np.stack([p.draw(rng, mode) for _ in range(4)])
+    batch = p.command_model.extrapolate(p.qpos, commands, 0.3, mode)
+    for row, command in zip(batch, commands, strict=True):
+        np.testing.assert_array_equal(
+            row, p.command_model.extrapolate(p.qpos, command, 0.3, mode)
+        )
+
+
+@robots
+def test_stationary_mode_has_no_velocities(parts, name):
+    model = parts[name].command_model
+    assert not (model.acting(Mode.STATIONARY) & model.is_velocity()).any()
+    assert (model.acting(Mode.MOBILE) & model.is_velocity()).any()
+
+
+# -- the proposal --------------------------------------------------------------------------
+
+
+@robots
+@modes
+def test_it_recovers_what_the_goal_was_made_with(parts, name, mode):
+    """Commands are redundant, so the head's pose is compared, not the command."""
+    p = parts[name]
+    for seed in range(5):
+        wanted = p.draw(np.random.default_rng(seed), mode)
+        goal = p.reach(wanted, mode)
+        far = measure_error(p.reach(p.space.neutral, mode), goal)
+        got = p.proposal.solve(p.qpos, {"head": goal}, mode, DT)
+        near = measure_error(p.reach(got, mode), goal)
+        # The effort keeps it a little short of the goal.
+        assert near[0] < max(0.1 * far[0], 0.01)
+        assert near[1] < max(0.15 * far[1], 0.05)
+
+
+@robots
+@modes
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_bounds_hold_and_what_does_not_act_stays_neutral(name, mode, seed, parts):
+    p, rng = parts[name], np.random.default_rng(seed)
+    goal = p.reach(p.space.neutral, mode)
+    goal[:3] += rng.uniform(-3, 3, 3)
+    goal[3:] = quat_multiply(quat_from_yaw(rng.uniform(-3, 3)), goal[3:])
+    start = rng.uniform(p.space.low, p.space.high)
+    got = p.proposal.solve(p.qpos, {"head": goal}, mode, DT, start=start)
+    assert (got >= p.space.low).all()
+    assert (got <= p.space.high).all()
+    rest = ~p.command_model.acting(mode)
+    np.testing.assert_array_equal(got[rest], p.space.neutral[rest])
+
+
+@robots
+def test_stationary_leaves_the_velocities_neutral(parts, name):
+    p = parts[name]
+    goal = p.reach(p.space.neutral, Mode.STATIONARY)
+    goal[0] += 1.0
+    got = p.proposal.solve(p.qpos, {"head": goal}, Mode.STATIONARY, DT)
+    velocities = p.command_model.is_velocity()
+    np.testing.assert_array_equal(got[velocities], p.space.neutral[velocities])
+
+
+@robots
+@modes
+def test_it_beats_random_commands(parts, name, mode):
+    """At goals within reach and beyond it, by its own least squares."""
+    p, rng = parts[name], np.random.default_rng(3)
+    scale, effort = p.proposal.scale, p.proposal._effort
+
+    def compute_objective(commands: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        future = p.command_model.extrapolate(p.qpos, commands, DT, mode)
+        poses = p.kinematics.compute_poses(future)[p.head]
+        error = np.square(poses[:, :3] - goal[:3]).sum(1)
+        error += np.square(0.4 * rotation_error(goal[3:], poses[:, 3:])).sum(1)
+        return error + np.square(effort * (commands - p.space.neutral) / scale).sum(1)
+
+    for _ in range(5):
+        goal = p.reach(p.draw(rng, mode, 0.6), mode)
+        goal[:3] += rng.uniform(-0.2, 0.2, 3)
+        got = p.proposal.solve(p.qpos, {"head": goal}, mode, DT)
+        others = np.stack([p.draw(rng, mode, 1.0) for _ in range(500)])
+        assert compute_objective(got[None], goal)[0] <= compute_objective(others, goal).min()
+
+
+@robots
+@modes
+def test_more_iterations_do_not_move_it(parts, name, mode):
+    """Four Gauss-Newton steps have converged: the Jacobian leads where it should."""
+    p = parts[name]
+    goal = p.reach(p.draw(np.random.default_rng(5), mode), mode)
+    few, many = (
+        p.make(iterations=count).solve(p.qpos, {"head": goal}, mode, DT) for count in (4, 40)
+    )
+    np.testing.assert_allclose(few, many, atol=0.02)
+
+
+def test_a_known_drift_is_walked_against(parts):
+    p, drift = parts["g1"], np.array([-0.1, 0.05, 0.1])
+    goal = p.reach(p.space.neutral, Mode.MOBILE)
+    got = p.proposal.solve(p.qpos, {"head": goal}, Mode.MOBILE, DT, drift=drift)
+    twist = p.command_model.compute_twist(got)
+    np.testing.assert_allclose(twist, -drift, atol=0.03)
+
+
+def test_the_centre_of_mass_stays_over_the_support_area(parts):
+    p = parts["rby1"]
+    area = SupportArea(p.morphology.support)
+    goal = p.reach(p.space.neutral, Mode.STATIONARY)
+    goal[0] += 0.6  # lean far ahead
+
+    def compute_excess(support: SupportArea | None) -> float:
+        got = p.make(support=support).solve(p.qpos, {"head": goal}, Mode.STATIONARY, DT)
+        future = p.command_model.extrapolate(p.qpos, got, DT, Mode.STATIONARY)
+        com = p.kinematics.compute_com(future)
+        return float(area.compute_excess(future[:7], com[:2]).max())
+
+    assert compute_excess(None) > 0.05
+    assert compute_excess(area) < 0.01
+
+
+def test_entries_that_are_not_free_stay_neutral(parts):
+    p = parts["g1"]
+    goal = p.reach(p.space.neutral, Mode.STATIONARY)
+    goal[2] -= 0.1
+    free = np.zeros(len(p.space), dtype=bool)
+    free[p.space.index("height")] = True
+    got = p.proposal.solve(p.qpos, {"head": goal}, Mode.STATIONARY, DT, free=free)
+    assert got[0] < 0.72
+    np.testing.assert_array_equal(got[1:], p.space.neutral[1:])
+
+
+@robots
+def test_without_goals_it_is_where_it_starts(parts, name):
+    p = parts[name]
+    start = p.draw(np.random.default_rng(0), Mode.MOBILE)
+    np.testing.assert_array_equal(
+        p.proposal.solve(p.qpos, {}, Mode.MOBILE, DT, start=start), start
+    )
+
+
+def test_a_dear_entry_is_used_less(parts):
+    p = parts["g1"]
+    goal = p.reach(p.space.neutral, Mode.STATIONARY)
+    goal[0] += 0.1
+    cheap, dear = (
+        p.make(weights=ProposalWeights(effort=effort)).solve(
+            p.qpos, {"head": goal}, Mode.STATIONARY, DT
+        )
+        for effort in (0.01, 1.0)
+    )
+    assert abs(dear[3]) < 0.5 * abs(cheap[3])
+
+
+# -- the box -------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
+def test_without_active_bounds_the_box_is_newtons_step(seed, size):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(size, size))
+    matrix, gradient = root @ root.T + np.eye(size), rng.normal(size=size)
+    far = np.full(size, 1e3)
+    step = _solve_in_box(matrix, gradient, -far, far)
+    np.testing.assert_allclose(matrix @ step, -gradient, atol=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
+def test_the_box_holds_and_is_no_worse_than_clipping(seed, size):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(size, size))
+    matrix, gradient = root @ root.T + 0.1 * np.eye(size), rng.normal(size=size)
+    low, high = -rng.uniform(0, 1, size), rng.uniform(0, 1, size)
+    step = _solve_in_box(matrix, gradient, low, high)
+    assert (step >= low).all()
+    assert (step <= high).all()
+    # It never releases a bound, so it may miss the optimum; where it stands it is stationary.
+    inside = (step > low + 1e-9) & (step < high - 1e-9)
+    np.testing.assert_allclose((matrix @ step + gradient)[inside], 0, atol=1e-8)
+
+
+# -- the direct baseline -------------------------------------------------------------------
+
+
+def make_state(p: Parts, qpos: np.ndarray, command: np.ndarray | None = None) -> RobotState:
+    rest = p.morphology.rest_action()
+    return RobotState(
+        time=0.0,
+        qpos=qpos,
+        qvel=np.zeros(p.model.nv),
+        memory=np.zeros(0),
+        command=rest.command if command is None else command,
+        arms=rest.arms,
+        mode=Mode.STATIONARY,
+        effort=np.zeros(p.model.nu),
+        true_qpos=qpos,
+        true_qvel=np.zeros(p.model.nv),
+        wall_time=0.0,
+    )
+
+
+def test_direct_maps_the_height_and_ignores_the_place(parts):
+    p = parts["g1"]
+    direct = DirectRetargeter(p.morphology, p.model)
+    state = make_state(p, p.qpos)
+    direct.reset(state)
+    goal = p.reach(p.space.neutral, Mode.STATIONARY, 2.0)
+    goal[2] -= 0.1
+    near = direct.plan(state, Goal({"head": goal})).command
+    assert near[0] == pytest.approx(p.space.neutral[0] - 0.1, abs=0.02)
+    far = goal.copy()
+    far[:2] += 5.0
+    direct.reset(state)
+    np.testing.assert_allclose(direct.plan(state, Goal({"head": far})).command, near, atol=1e-3)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.2, -2.5])
+def test_direct_maps_the_velocity_in_the_heading_of_the_base(parts, yaw):
+    p = parts["g1"]
+    direct = DirectRetargeter(p.morphology, p.model)
+    qpos = p.qpos.copy()
+    qpos[3:7] = quat_from_yaw(yaw)
+    state = make_state(p, qpos)
+    direct.reset(state)
+    velocity = np.zeros(6)
+    velocity[:3] = quat_rotate(quat_from_yaw(yaw), np.array([0.4, -0.1, 0.0]))
+    velocity[5] = 0.3
+    goal = Goal({"head": p.reach(p.space.neutral, Mode.MOBILE)}, {"head": velocity}, Mode.MOBILE)
+    plan = direct.plan(state, goal)
+    np.testing.assert_allclose(plan.command[-3:], [0.4, -0.1, 0.3], atol=1e-9)
+    assert plan.mode is Mode.MOBILE
+    np.testing.assert_array_equal(plan.commands, [plan.command])
+    standing = direct.plan(state, Goal(goal.poses, goal.velocities, Mode.STATIONARY))
+    np.testing.assert_array_equal(standing.command[-3:], 0)
+
+
+@robots
+def test_direct_stays_within_the_bounds(parts, name):
+    p = parts[name]
+    direct = DirectRetargeter(p.morphology, p.model)
+    state = make_state(p, p.qpos)
+    direct.reset(state)
+    goal = p.reach(p.space.neutral, Mode.MOBILE)
+    goal[2] -= 2
+    command = direct.plan(
+        state, Goal({"head": goal}, {"head": np.full(6, 50.0)}, Mode.MOBILE)
+    ).command
+    assert (command >= p.space.low).all()
+    assert (command <= p.space.high).all()
+
+
+def test_direct_plans_at_the_rate_that_is_asked_for(parts):
+    p = parts["g1"]
+    assert DirectRetargeter(p.morphology, p.model, 50.0).control_period(Mode.MOBILE) == 0.02
