@@ -33,7 +33,7 @@ from xop_lerobot.low_level.falcon_observation import (
     OBSERVATION_SIZE,
     FalconLikePolicy,
 )
-from xop_lerobot.low_level.student import Student, save_weights
+from xop_lerobot.low_level.student import Student, load_weights, save_weights
 from xop_lerobot.low_level.trial import BatchSimulation
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -49,7 +49,7 @@ WIDE = ExcitationConfig(
     vy=0.6,
     yaw_rate=1.0,
     arm_range=0.95,
-    arm_speed=5.0,
+    arm_speed=3.0,
     push=0.6,
     push_period=4.0,
     hand_force=15.0,
@@ -62,6 +62,9 @@ USUAL = ExcitationConfig(waist_roll=0.2, waist_pitch=(-0.2, 0.3), push_period=4.
 EPISODE_STEPS = 1000
 BLOCK_STEPS = 50
 """Steps for which one of teacher and student drives a robot before it is drawn again."""
+
+REFINE_AFTER = 3
+"""Rounds of experience before an earlier student is trained further."""
 
 OUTPUT_WEIGHTS = np.ones(NUM_JOINTS)
 OUTPUT_WEIGHTS[13:15] = 0.1  # waist roll and pitch: only seen as a last action
@@ -84,13 +87,25 @@ class Network(FalconLikePolicy):
         self.body = nn.Sequential(*layers[:-1])
 
     def standardise(self, observation: torch.Tensor) -> torch.Tensor:
-        """Shift and scale observations, and cut off what is far out of the ordinary."""
+        """Shift and scale observations to about zero mean and unit spread."""
         return (observation - self.mean) / self.spread
 
     def infer(self, observation: np.ndarray) -> np.ndarray:
         """Run the network; see `FalconLikePolicy.infer`."""
         with torch.no_grad():
             return self.body(self.standardise(torch.from_numpy(observation))).numpy()
+
+    def load(self, weights: list[np.ndarray], biases: list[np.ndarray]) -> None:
+        """Take the layers of a saved student; the inverse of `layers`."""
+        mean, spread = self.mean.double().numpy(), self.spread.double().numpy()
+        weights, biases = [weights[0].astype(float), *weights[1:]], list(biases)
+        biases[0] = biases[0] + mean @ weights[0]
+        weights[0] = weights[0] * spread[:, None]
+        linear = [module for module in self.body if isinstance(module, nn.Linear)]
+        with torch.no_grad():
+            for layer, weight, bias in zip(linear, weights, biases, strict=True):
+                layer.weight.copy_(torch.from_numpy(weight.T))
+                layer.bias.copy_(torch.from_numpy(bias))
 
     def layers(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Return matrices (inputs, outputs) and offsets, the standardisation folded in."""
@@ -248,18 +263,23 @@ def distill(arguments: argparse.Namespace) -> Network:
     experience = Experience(arguments.rounds * robots * steps)
     collector = Collector(Falcon(arguments.teacher), robots, arguments.threads, rng)
     start = time.monotonic()
+    refines = arguments.init is not None
+    driver: FalconLikePolicy | None = Student(str(arguments.init)) if refines else None
     network: Network | None = None
     for turn in range(arguments.rounds):
-        share = max(0.0, 1.0 - turn / max(1, 0.3 * arguments.rounds))
+        share = 0.0 if refines else max(0.0, 1.0 - turn / max(1, 0.3 * arguments.rounds))
         collector.falls = 0
-        collector.collect(network, share, steps, experience)
+        collector.collect(network or driver, share, steps, experience)
+        if refines and turn < REFINE_AFTER:
+            continue  # too little experience yet: training would forget more than it learns
         if network is None:
             network = Network(
                 tuple(arguments.hidden), experience.observations[: experience.size].float()
             )
-        loss = train(
-            network, experience, arguments.updates, (1e-3, 3e-4), arguments.batch, generator
-        )
+            if refines:
+                network.load(*load_weights(arguments.init))
+        rates = (3e-4, 1e-4) if refines else (1e-3, 3e-4)
+        loss = train(network, experience, arguments.updates, rates, arguments.batch, generator)
         save_weights(arguments.out, *network.layers())  # a long run leaves something if cut off
         logger.info(
             "round %d/%d: teacher share %.2f, falls %d, loss %.5f, %d samples, %.0f s",
@@ -268,8 +288,9 @@ def distill(arguments: argparse.Namespace) -> Network:
         )  # fmt: skip
     collector.simulation.close()
     if network is None:
-        raise BadValue(f"--rounds must be at least 1, got {arguments.rounds}")
-    for part, rates in enumerate(((5e-4, 1e-4), (1e-4, 2e-5))):
+        least = REFINE_AFTER + 1 if refines else 1
+        raise BadValue(f"--rounds must be at least {least}, got {arguments.rounds}")
+    for part, rates in enumerate(((3e-4, 1e-4) if refines else (5e-4, 1e-4), (1e-4, 2e-5))):
         loss = train(
             network, experience, arguments.final_updates // 2, rates, arguments.batch, generator
         )
@@ -290,11 +311,12 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--docs", type=Path, help="Markdown page whose table is to be replaced")
     parser.add_argument("--evaluate-only", action="store_true", help="compare, do not train")
     parser.add_argument("--hidden", type=int, nargs="+", default=[384, 192], help="layer widths")
-    parser.add_argument("--rounds", type=int, default=30, help="rounds of DAgger")
+    parser.add_argument("--init", type=Path, help="weights of a student to train further, .npz")
+    parser.add_argument("--rounds", type=int, default=24, help="rounds of DAgger")
     parser.add_argument("--robots", type=int, default=256, help="robots at once")
     parser.add_argument("--steps", type=int, default=150, help="policy steps a round [20 ms]")
     parser.add_argument("--updates", type=int, default=300, help="gradient steps a round")
-    parser.add_argument("--final-updates", type=int, default=10000, help="gradient steps at last")
+    parser.add_argument("--final-updates", type=int, default=8000, help="gradient steps at last")
     parser.add_argument("--batch", type=int, default=1024, help="samples a gradient step")
     parser.add_argument("--trials", type=int, default=200, help="sequences of the comparison")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of a sequence [s]")

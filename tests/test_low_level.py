@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import mujoco
@@ -402,6 +405,22 @@ def test_falcon_wrong_shape_or_format(tmp_path: Path) -> None:
     text.write_text("not a network")
     with pytest.raises(PolicyFileError, match="is not an ONNX model"):
         Falcon(str(text))
+
+
+def test_distillation_runs_from_a_teacher_file(tmp_path: Path) -> None:
+    """The script makes loadable weights and a whole report."""
+    script = Path(__file__).parents[1] / "scripts" / "distill_low_level.py"
+    out, report = tmp_path / "student.npz", tmp_path / "report.json"
+    small = "--robots 8 --steps 20 --updates 3 --final-updates 2 --batch 32 --trials 2 --seconds 1"
+    common = [sys.executable, str(script), "--teacher", find_teacher(), *small.split()]
+    command = [*common, "--rounds", "1", "--out", str(out), "--report", str(report)]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    facts = json.loads(report.read_text())
+    assert facts["trials"] == 2  # noqa: PLR2004
+    assert set(facts["teacher"]) == set(facts["student"])
+    assert facts["act_ms"]["student"]["30"] > 0
+    weights, _ = load_weights(out)
+    assert [w.shape for w in weights] == [(575, 384), (384, 192), (192, 29)]
 
 
 def test_wheel_speeds_by_hand() -> None:

@@ -101,7 +101,7 @@ def compare_policies(  # noqa: PLR0913
         "responses": {
             name: measure_responses(policy, threads) for name, policy in policies.items()
         },
-        "act_ms": {name: measure_speed(policy) for name, policy in policies.items()},
+        "act_ms": measure_speeds(policies),
     }
 
 
@@ -160,10 +160,15 @@ def measure_responses(policy: FalconLikePolicy, threads: int = 2) -> dict[str, d
     }
 
 
-def measure_speed(policy: FalconLikePolicy, repeats: int = 100) -> dict[str, float]:
-    """Measure the median time of one `act` [ms], by batch size."""
+def measure_speeds(
+    policies: Mapping[str, FalconLikePolicy], repeats: int = 200
+) -> dict[str, dict[str, float]]:
+    """Measure the median time of one `act` [ms], by policy and batch size.
+
+    The policies take turns, so that whatever else the machine does slows all of them.
+    """
     qpos = make_morphology("g1").standing_qpos()
-    result = {}
+    result: dict[str, dict[str, float]] = {name: {} for name in policies}
     for n in (1, 30, 128):
         inputs = (
             np.tile(qpos, (n, 1)),
@@ -171,12 +176,15 @@ def measure_speed(policy: FalconLikePolicy, repeats: int = 100) -> dict[str, flo
             np.tile([0.75, 0, 0, 0, 0, 0, 0], (n, 1)),
             np.zeros((n, 14)),
         )
-        memory, times = policy.initial_memory(n), []
+        memory = {name: policy.initial_memory(n) for name, policy in policies.items()}
+        times: dict[str, list[float]] = {name: [] for name in policies}
         for _ in range(repeats):
-            start = time.perf_counter()
-            memory = policy.act(*inputs, memory, Mode.STATIONARY).memory
-            times.append(time.perf_counter() - start)
-        result[str(n)] = 1e3 * float(np.median(times))
+            for name, policy in policies.items():
+                start = time.perf_counter()
+                memory[name] = policy.act(*inputs, memory[name], Mode.STATIONARY).memory
+                times[name].append(time.perf_counter() - start)
+        for name in policies:
+            result[name][str(n)] = 1e3 * float(np.median(times[name]))
     return result
 
 
