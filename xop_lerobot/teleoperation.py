@@ -171,9 +171,7 @@ class Teleoperation:
         command = np.where(space.mobile_only, space.neutral, state.command)
         return RobotAction(command, Mode.STATIONARY, state.arms)
 
-    def _drive(
-        self, state: RobotState, goal: Goal, head: np.ndarray, dt: float
-    ) -> RobotAction:
+    def _drive(self, state: RobotState, goal: Goal, head: np.ndarray, dt: float) -> RobotAction:
         self._update_plan(state, goal)
         arms = state.arms.copy()
         wrists = compute_wrist_goals(goal.poses, head)

@@ -51,9 +51,7 @@ def quat_exp(rotvec: np.ndarray) -> np.ndarray:
     rotvec = np.asarray(rotvec, float)
     angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
     # np.sinc(x) = sin(pi x)/(pi x) is smooth through zero.
-    return np.concatenate(
-        [np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotvec], axis=-1
-    )
+    return np.concatenate([np.cos(angle / 2), 0.5 * np.sinc(angle / (2 * np.pi)) * rotvec], axis=-1)
 
 
 def quat_log(q: np.ndarray) -> np.ndarray:
@@ -74,7 +72,7 @@ def quat_from_yaw(yaw: np.ndarray | float) -> np.ndarray:
 
 
 def quat_yaw(q: np.ndarray) -> np.ndarray:
-    """Heading [rad] of the frame's X axis about world Z (Tait-Bryan ZYX). Shape (..., 4) -> (...)."""
+    """Heading of the X axis about world Z (Tait-Bryan ZYX) [rad]. Shape (..., 4) -> (...)."""
     w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 

@@ -123,7 +123,8 @@ def limit_action(
     """What of `action` a robot executes after `previous` within `dt` [s].
 
     Teleoperator and robot both call it, so that the recorded action is the executed one:
-    limiting twice is limiting once.
+    limiting twice is limiting once. Datasets hold single precision, so actions are rounded to
+    it, and a replayed action is the recorded one to the last bit.
     """
     command = morphology.command_space.limit(action.command, previous.command, dt, action.mode)
     num_joints = sum(len(arm.joints) for arm in morphology.arms)
@@ -132,4 +133,8 @@ def limit_action(
     arms[:num_joints] = np.clip(
         arms[:num_joints], previous.arms[:num_joints] - reach, previous.arms[:num_joints] + reach
     )
-    return RobotAction(command, action.mode, arms)
+    return RobotAction(_to_single(command), action.mode, _to_single(arms))
+
+
+def _to_single(vector: np.ndarray) -> np.ndarray:
+    return vector.astype(np.float32).astype(float)

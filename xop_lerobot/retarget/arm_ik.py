@@ -127,9 +127,7 @@ class ArmIk:
         return self._configuration.q[self._qpos]
 
 
-def _find_pairs(
-    model: mujoco.MjModel, morphology: Morphology
-) -> list[tuple[list[int], list[int]]]:
+def _find_pairs(model: mujoco.MjModel, morphology: Morphology) -> list[tuple[list[int], list[int]]]:
     """Colliding geoms of each forearm and hand, against those of the rest of the body."""
     solid = [i for i in range(model.ngeom) if model.geom_contype[i] and model.geom_conaffinity[i]]
     pairs, forearms = [], []

@@ -16,11 +16,11 @@ class DriftObserver:
     .. math:: b \leftarrow b + (1 - e^{-dt/\tau})(v_{measured} - v_{command} - b)
 
     along and across the heading, and about the vertical. The command counts with the lag of a
-    policy that takes it up, or else every start and stop would look like a drift. A walking policy drifts by several
-    centimetres a second, by more when it leans; the horizon is too short to tell that from the
-    sway of the gait. With b in the extrapolated terminal cost the controller has no steady
-    offset (an output disturbance model, as in offset-free model predictive control, Pannocchia
-    and Rawlings, 2003).
+    policy that takes it up, or else every start and stop would look like a drift. A walking
+    policy drifts by several centimetres a second, by more when it leans; the horizon is too
+    short to tell that from the sway of the gait. With b in the extrapolated terminal cost the
+    controller has no steady offset (an output disturbance model, as in offset-free model
+    predictive control, Pannocchia and Rawlings, 2003).
 
     Args:
         command_model: What a command asks of the base.

@@ -39,9 +39,7 @@ class Kmppi:
         config: Numbers of samples and knots, kernel, weighting.
     """
 
-    def __init__(
-        self, horizon: int, low: np.ndarray, high: np.ndarray, config: MpcConfig
-    ) -> None:
+    def __init__(self, horizon: int, low: np.ndarray, high: np.ndarray, config: MpcConfig) -> None:
         self.horizon, self.low, self.high, self.config = horizon, low, high, config
         num_knots = min(config.num_knots, horizon)
         self.knot_times = np.linspace(0, horizon - 1, num_knots) if num_knots > 1 else np.zeros(1)

@@ -66,9 +66,7 @@ class MpcRetargeter(Retargeter):
         self.space = morphology.command_space
         self.configs = {mode: _override(morphology.mpc_config(mode), config) for mode in Mode}
         self.rollout = PolicyRollout(model, policy, config.num_threads)
-        self.command_model = CommandModel(
-            model, self.space, morphology.effects, morphology.pivot
-        )
+        self.command_model = CommandModel(model, self.space, morphology.effects, morphology.pivot)
         self.sites = {name: morphology.frames[name] for name in frames}
         obstacles = make_obstacles(model)
         hull = morphology.hull_points if obstacles else {}
@@ -140,7 +138,10 @@ class MpcRetargeter(Retargeter):
         goals = self._preview(goal, ahead, config)
         proposal = self.proposals[mode].solve(
             state.qpos,
-            {name: poses[0] for name, poses in self._preview(goal, _at(config.proposal_s), config).items()},
+            {
+                name: poses[0]
+                for name, poses in self._preview(goal, _at(config.proposal_s), config).items()
+            },
             mode,
             config.proposal_s,
             start=planner.commands[0],
@@ -190,9 +191,7 @@ class MpcRetargeter(Retargeter):
         else:
             planner.shift(max(0.0, state.time - self._last[0]) / POLICY_DT)
 
-    def _preview(
-        self, goal: Goal, ahead: np.ndarray, config: MpcConfig
-    ) -> dict[str, np.ndarray]:
+    def _preview(self, goal: Goal, ahead: np.ndarray, config: MpcConfig) -> dict[str, np.ndarray]:
         """Goals `ahead` seconds from now, at constant velocity up to `preview_s`."""
         times = np.minimum(ahead, config.preview_s)[:, None]
         goals = {}

@@ -46,8 +46,8 @@ class KinematicProposal:
     r"""Solves :math:`\min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \|\rho (a - a_0)/s\|^2`.
 
     φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` the neutral
-    command, s half the range of each entry and ρ its effort. A few damped Gauss-Newton steps within the
-    bounds; the Jacobian by finite differences, all columns in one batch.
+    command, s half the range of each entry and ρ its effort. A few damped Gauss-Newton steps
+    within the bounds; the Jacobian by finite differences, all columns in one batch.
 
     Args:
         command_model: What a command does.

@@ -118,5 +118,9 @@ class PolicyRollout:
             policy_s += between - start
             physics_s += end - between
         return Prediction(
-            states[..., 1 : 1 + nq], states[..., 1 + nq : 1 + nq + nv], commands, policy_s, physics_s
+            states[..., 1 : 1 + nq],
+            states[..., 1 + nq : 1 + nq + nv],
+            commands,
+            policy_s,
+            physics_s,
         )

@@ -55,9 +55,7 @@ def _level(pose: np.ndarray) -> np.ndarray:
     return make_pose(pose[:3], quat_from_yaw(quat_yaw(pose[3:])))
 
 
-def _approach(
-    start: np.ndarray, end: np.ndarray, max_offset: float, max_turn: float
-) -> np.ndarray:
+def _approach(start: np.ndarray, end: np.ndarray, max_offset: float, max_turn: float) -> np.ndarray:
     """Go from one pose towards another, at most so far. Shape (7,)."""
     offset = end[:3] - start[:3]
     turn = rotation_error(end[3:], start[3:])

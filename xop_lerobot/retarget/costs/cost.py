@@ -52,8 +52,11 @@ class Evaluation:
 
 
 class Cost(ABC):
-    """One term of the cost. Sums over a horizon are means over its steps, so that a weight
-    means the same for every horizon."""
+    """One term of the cost.
+
+    Sums over a horizon are means over its steps, so that a weight means the same for every
+    horizon.
+    """
 
     name: str
 
