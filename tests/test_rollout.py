@@ -137,6 +137,8 @@ def test_a_prediction_is_what_the_plant_then_does(parts, name, mode):
     if name == "rby1" and mode is Mode.STATIONARY:
         command[0] = 0.0
         command[3] += 0.004
+    command = command.astype(np.float32).astype(float)  # as robots execute it
+    loop.execute(loop.action, POLICY_DT)  # the arms' rest angles too
     for _ in range(2):  # again from a state in motion, with a memory that has seen it
         state = loop.state
         steps = 8
