@@ -142,6 +142,22 @@ def rotation_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
     return quat_log(quat_multiply(goal, quat_conjugate(quat)))
 
 
+def heading_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    r"""Error of roll and pitch, each in its own heading, and of the heading [rad].
+
+    With :math:`R = R_z(\psi) T`: :math:`(\log(T_{goal} T^{-1})_{x,y},\ \psi_{goal} - \psi)`. For
+    small errors it is `rotation_error` in heading axes; but a robot that faces away from its goal
+    is not asked to lean sideways because the operator leans forward.
+
+    Shapes (..., 4) and (..., 4) -> (..., 3).
+    """
+    yaw_goal, yaw = quat_yaw(goal), quat_yaw(quat)
+    tilt_goal = quat_multiply(quat_from_yaw(-yaw_goal), goal)
+    tilt = quat_multiply(quat_from_yaw(-yaw), quat)
+    error = rotation_error(tilt_goal, tilt)
+    return np.concatenate([error[..., :2], wrap_angle(yaw_goal - yaw)[..., None]], axis=-1)
+
+
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray:
     """Wrap to (-pi, pi] [rad]."""
     return -((-np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi)

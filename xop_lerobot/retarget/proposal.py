@@ -13,7 +13,7 @@ from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.transforms import rotation_error
+from xop_lerobot.transforms import heading_error
 
 _STEP = 1e-4  # finite-difference step, in shares of a command's scale
 
@@ -24,7 +24,7 @@ class ProposalWeights:
 
     Attributes:
         position: Of the position error along x, y, z [1/m].
-        orientation: Of the orientation error about x, y, z [1/rad].
+        orientation: Of roll, pitch and heading, as in `heading_error` [1/rad].
         effort: Of the command's distance from neutral, over its scale [1].
         support: Of the centre of mass beyond the support area [1/m].
     """
@@ -138,7 +138,7 @@ class KinematicProposal:
         for name, goal in goals.items():
             pose = poses[self.sites[name]]
             parts.append((pose[:, :3] - goal[:3]) * self.weights.position)
-            parts.append(-rotation_error(goal[3:], pose[:, 3:]) * self.weights.orientation)
+            parts.append(-heading_error(goal[3:], pose[:, 3:]) * self.weights.orientation)
         if self.support is not None:
             com = self.kinematics.compute_com(future)[:, :2]
             parts.append(self.weights.support * self.support.compute_excess(future[:, :7], com))

@@ -12,8 +12,8 @@ EFFECTS = (
     # While walking the policy neither squats nor turns its waist.
     Effect(Acts.HEIGHT, lag_s=0.3, modes=STATIONARY),
     Effect(Acts.JOINT, "waist_yaw_joint", lag_s=0.2, modes=STATIONARY),
-    Effect(Acts.JOINT, "waist_roll_joint", lag_s=0.1),
-    Effect(Acts.JOINT, "waist_pitch_joint", lag_s=0.1),
+    Effect(Acts.JOINT, "waist_roll_joint", lag_s=0.1, effort=5.0),
+    Effect(Acts.JOINT, "waist_pitch_joint", lag_s=0.1, effort=2.0),
     Effect(Acts.FORWARD),
     Effect(Acts.LEFT),
     Effect(Acts.TURN),
@@ -27,13 +27,13 @@ CONFIGS = {
         weights=CostWeights(orientation=0.2),
     ),
     Mode.MOBILE: MpcConfig(
-        num_samples=16,
-        horizon=10,
+        num_samples=12,
+        horizon=16,
         noise_std={
             "waist_roll": 0.03, "waist_pitch": 0.05, "vx": 0.25, "vy": 0.2, "yaw_rate": 0.3,
         },
         # A walking robot that leans as its operator does pays with its balance.
-        weights=CostWeights(orientation=0.1, tilt_share=0.2),
+        weights=CostWeights(orientation=0.05, tilt_share=0.2),
     ),
 }  # fmt: skip
 

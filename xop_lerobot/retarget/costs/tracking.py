@@ -6,7 +6,7 @@ import numpy as np
 
 from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import rotation_error
+from xop_lerobot.transforms import heading_error
 
 
 class TrackingCost(Cost):
@@ -30,12 +30,12 @@ class TrackingCost(Cost):
 def compute_tracking(poses: np.ndarray, goals: np.ndarray, weights: CostWeights) -> np.ndarray:
     r"""Weighted squared error of poses. Shapes (..., 7) and (..., 7) -> (...).
 
-    .. math:: w_p\|p - p^d\|^2 + w_\theta(e_z^2 + \kappa(e_x^2 + e_y^2)),\quad
-       e = \log(\theta^d \theta^{-1})
+    .. math:: w_p\|p - p^d\|^2 + w_\theta(e_\psi^2 + \kappa(e_x^2 + e_y^2))
 
-    in world axes, with κ the share of a tilt: the paper's :math:`d(\theta, \theta^d)^2` at κ = 1.
+    with the errors of heading and tilt of `heading_error`, and κ the share of a tilt: at κ = 1
+    and for small errors, the paper's :math:`d(\theta, \theta^d)^2`.
     """
     position = np.square(poses[..., :3] - goals[..., :3]).sum(-1)
-    error = np.square(rotation_error(goals[..., 3:], poses[..., 3:]))
+    error = np.square(heading_error(goals[..., 3:], poses[..., 3:]))
     turn = error[..., 2] + weights.tilt_share * (error[..., 0] + error[..., 1])
     return weights.position * position + weights.orientation * turn
