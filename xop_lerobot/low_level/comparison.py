@@ -217,7 +217,7 @@ def write_table(report: Mapping[str, Any]) -> str:
     ]
     for name, one in report["responses"]["teacher"].items():
         two = report["responses"]["student"][name]
-        cells = [f"{one[key]:.2f} / {two[key]:.2f}" for key in one if key != "falls"]
+        cells = [f"{one[key]:z.2f} / {two[key]:z.2f}" for key in one if key != "falls"]
         lines.append(f"| {name} | {' | '.join(cells)} | {one['falls']:g} / {two['falls']:g} |")
     return "\n".join(lines) + "\n"
 
