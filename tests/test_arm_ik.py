@@ -219,9 +219,7 @@ def test_pairs_leave_neighbours_out(arms, name):
     """No pair holds two geoms of one arm's own chain, and every pair is named once."""
     a = arms[name]
     seen = set()
-    for (own, rest), arm in zip(
-        _find_pairs(a.model, a.morphology), a.morphology.arms, strict=True
-    ):
+    for (own, rest), arm in zip(_find_pairs(a.model, a.morphology), a.morphology.arms, strict=True):
         root = int(a.model.joint(arm.joints[0]).bodyid[0])
         assert own
         assert rest

@@ -26,13 +26,13 @@ from xop_lerobot.retarget.costs import (
 )
 from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
 from xop_lerobot.transforms import (
+    heading_error,
     make_pose,
     quat_exp,
     quat_from_rpy,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
-    rotation_error,
 )
 
 K, H, NQ, NV, NA = 5, 4, 9, 8, 3
@@ -76,7 +76,7 @@ def make_evaluation(seed: int = 0, **fields) -> Evaluation:
 
 def compute_pose_cost(pose: np.ndarray, goal: np.ndarray, w: CostWeights) -> float:
     position = sum((pose[i] - goal[i]) ** 2 for i in range(3))
-    x, y, z = rotation_error(goal[3:], pose[3:])
+    x, y, z = heading_error(goal[3:], pose[3:])
     return w.position * position + w.orientation * (z * z + w.tilt_share * (x * x + y * y))
 
 
@@ -124,7 +124,7 @@ def test_tracking_by_hand():
 def test_a_tilt_counts_less_than_a_turn(axis, share):
     goal = make_pose([0, 0, 1], quat_from_yaw(0.8))
     turn = quat_exp(0.2 * np.eye(3)[axis])
-    pose = make_pose([0, 0, 1], quat_multiply(turn, goal[3:]))
+    pose = make_pose([0, 0, 1], quat_multiply(goal[3:], turn))
     e = make_evaluation(terminal_poses={"head": pose[None]}, terminal_goals={"head": goal})
     e = dataclasses.replace(e, qpos=e.qpos[:1])
     expected = WEIGHTS.terminal * WEIGHTS.orientation * share * 0.2**2
@@ -148,7 +148,10 @@ def compute_stance_slowly(e: Evaluation, groups: tuple[tuple[str, ...], ...]) ->
             speeds, heights = [], []
             for group in groups:
                 squares = [
-                    sum(((e.points[s][i, k, j] - e.points[s][i, k - 1, j]) / DT) ** 2 for j in range(3))
+                    sum(
+                        ((e.points[s][i, k, j] - e.points[s][i, k - 1, j]) / DT) ** 2
+                        for j in range(3)
+                    )
                     for s in group
                 ]
                 speeds.append(sum(squares) / len(group))
@@ -201,7 +204,9 @@ def test_wheels_may_roll_in_mobile_mode_only():
 
 # -- collision -----------------------------------------------------------------------------
 
-BOX = Obstacle("box", np.array([0.5, -0.2, 0.4]), quat_from_rpy(0.2, 0.4, 0.9), np.array([0.3, 0.1, 0.2]))
+BOX = Obstacle(
+    "box", np.array([0.5, -0.2, 0.4]), quat_from_rpy(0.2, 0.4, 0.9), np.array([0.3, 0.1, 0.2])
+)
 
 
 @given(st.tuples(*[st.floats(-1.5, 1.5)] * 3).map(np.array))
@@ -280,7 +285,9 @@ def test_obstacles_are_what_is_fixed_and_collides():
 
 
 def test_collision_equals_its_formula():
-    wall = Obstacle("wall", np.array([0.0, 2, 0]), np.array([1.0, 0, 0, 0]), np.array([3.0, 0.1, 3]))
+    wall = Obstacle(
+        "wall", np.array([0.0, 2, 0]), np.array([1.0, 0, 0, 0]), np.array([3.0, 0.1, 3])
+    )
     radii = {"a": 0.1, "b": 0.2}
     e = make_evaluation(weights=CostWeights(collision=0.7, collision_velocity=1.9))
     alpha, beta = 4.0, 6.0

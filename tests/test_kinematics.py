@@ -169,14 +169,16 @@ def test_what_is_not_on_the_way_is_not_refused():
 
 @pytest.mark.xfail(strict=True, raises=ValueError, reason="no moving joint: np.stack of nothing")
 def test_a_robot_whose_sites_are_all_on_its_base():
-    model = build('<body name="b"><freejoint/><geom size="0.1"/><site name="s" pos="1 0 0"/></body>')
+    model = build(
+        '<body name="b"><freejoint/><geom size="0.1"/><site name="s" pos="1 0 0"/></body>'
+    )
     assert_equal_to_mujoco(model, ("s",), None)
 
 
 @pytest.mark.xfail(strict=True, reason="the reference angle of a joint is ignored")
 def test_a_joint_with_a_reference_angle():
     model = build(
-        '<body name="b"><joint axis="0 0 1" ref="30"/><geom size="0.1"/><site name="s" pos="1 0 0"/>'
-        "</body>"
+        '<body name="b"><joint axis="0 0 1" ref="30"/><geom size="0.1"/>'
+        '<site name="s" pos="1 0 0"/></body>'
     )
     assert_equal_to_mujoco(model, ("s",), None)

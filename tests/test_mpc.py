@@ -372,5 +372,7 @@ def test_the_goal_is_carried_on_at_its_velocity(bench):
         held = min(time, config.preview_s)
         np.testing.assert_allclose(pose[:3], start[:3] + held * velocity[:3])
         ahead = quat_rotate(pose[3:], np.array([1.0, 0, 0]))
-        expected = quat_rotate(quat_from_yaw(0.5 * held), quat_rotate(start[3:], np.array([1.0, 0, 0])))
+        expected = quat_rotate(
+            quat_from_yaw(0.5 * held), quat_rotate(start[3:], np.array([1.0, 0, 0]))
+        )
         np.testing.assert_allclose(ahead, expected, atol=1e-9)

@@ -16,6 +16,7 @@ from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights, _solve_in_box
 from xop_lerobot.state import Goal, RobotState
 from xop_lerobot.transforms import (
+    heading_error,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
@@ -135,9 +136,7 @@ def test_a_batch_equals_one_at_a_time(parts, name, mode):
     commands = np.stack([p.draw(rng, mode) for _ in range(4)])
     batch = p.command_model.extrapolate(p.qpos, commands, 0.3, mode)
     for row, command in zip(batch, commands, strict=True):
-        np.testing.assert_array_equal(
-            row, p.command_model.extrapolate(p.qpos, command, 0.3, mode)
-        )
+        np.testing.assert_array_equal(row, p.command_model.extrapolate(p.qpos, command, 0.3, mode))
 
 
 @robots
@@ -204,7 +203,7 @@ def test_it_beats_random_commands(parts, name, mode):
         future = p.command_model.extrapolate(p.qpos, commands, DT, mode)
         poses = p.kinematics.compute_poses(future)[p.head]
         error = np.square(poses[:, :3] - goal[:3]).sum(1)
-        error += np.square(0.4 * rotation_error(goal[3:], poses[:, 3:])).sum(1)
+        error += np.square(0.4 * heading_error(goal[3:], poses[:, 3:])).sum(1)
         return error + np.square(effort * (commands - p.space.neutral) / scale).sum(1)
 
     for _ in range(5):
@@ -266,9 +265,7 @@ def test_entries_that_are_not_free_stay_neutral(parts):
 def test_without_goals_it_is_where_it_starts(parts, name):
     p = parts[name]
     start = p.draw(np.random.default_rng(0), Mode.MOBILE)
-    np.testing.assert_array_equal(
-        p.proposal.solve(p.qpos, {}, Mode.MOBILE, DT, start=start), start
-    )
+    np.testing.assert_array_equal(p.proposal.solve(p.qpos, {}, Mode.MOBILE, DT, start=start), start)
 
 
 def test_a_dear_entry_is_used_less(parts):

@@ -48,9 +48,7 @@ class Parts:
     def predict(self, state: RobotState, commands: np.ndarray, mode: Mode, threads: int = 1):
         rollout = PolicyRollout(self.model, self.policy, threads)
         try:
-            return rollout.predict(
-                state.qpos, state.qvel, state.memory, commands, state.arms, mode
-            )
+            return rollout.predict(state.qpos, state.qvel, state.memory, commands, state.arms, mode)
         finally:
             rollout.close()
 

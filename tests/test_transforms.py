@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from xop_lerobot.transforms import (
     IDENTITY_POSE,
+    heading_error,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -121,6 +122,28 @@ def test_rotation_error_of_a_yaw_is_about_z_whatever_the_tilt():
     tilted = quat_from_rpy(0.4, -0.3, 1.0)
     goal = quat_multiply(quat_from_yaw(0.2), tilted)
     np.testing.assert_allclose(rotation_error(goal, tilted), [0, 0, 0.2], atol=1e-12)
+
+
+@given(angles, st.tuples(*[st.floats(-1e-4, 1e-4)] * 3).map(np.array))
+def test_a_small_heading_error_is_the_rotation_error_in_the_headings_axes(yaw, turn):
+    q = quat_from_yaw(yaw)
+    goal = quat_multiply(quat_exp(turn), q)
+    in_heading = quat_rotate(quat_conjugate(q), rotation_error(goal, q))
+    np.testing.assert_allclose(heading_error(goal, q), in_heading, atol=1e-7)
+
+
+@given(angles, angles, st.floats(-0.8, 0.8), st.floats(-0.8, 0.8))
+def test_who_leans_the_same_way_in_another_heading_has_no_error_of_tilt(yaw, other, roll, pitch):
+    goal, q = quat_from_rpy(roll, pitch, yaw), quat_from_rpy(roll, pitch, other)
+    error = heading_error(goal, q)
+    np.testing.assert_allclose(error[:2], 0, atol=1e-7)
+    assert wrap_angle(error[2] - (yaw - other)) == pytest.approx(0, abs=1e-7)
+
+
+@given(quats, quats)
+def test_heading_error_of_itself_is_nothing_and_is_bounded(a, b):
+    np.testing.assert_allclose(heading_error(a, a), 0, atol=1e-7)
+    assert np.abs(heading_error(a, b)).max() <= np.pi + 1e-9
 
 
 # -- agreement with MuJoCo -----------------------------------------------------------------
