@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -400,6 +401,22 @@ def test_support_equals_its_formula():
     np.testing.assert_allclose(SupportCost(area).compute(e), expected)
 
 
+@pytest.mark.parametrize("base", [(0, 0, 0), (2, -1, 0.7)])
+def test_a_lean_counts_from_where_the_robot_rests(base):
+    """The centre of mass 0.2 m ahead of its place of rest, in the heading of the base."""
+    pose = base_at(*base)
+    com = pose[:3] + quat_rotate(pose[3:], np.array([0.25, 0.0, 0.6]))
+    e = make_evaluation(
+        com=np.tile(com, (1, H + 1, 1)),
+        qpos=np.tile(pose, (1, H + 1, 1)),
+        terminal_com=com[None],
+        terminal_qpos=pose[None],
+        weights=CostWeights(lean=3.0),
+    )
+    area = SupportArea(((1, -1), (1, 1), (-1, 1), (-1, -1)), resting=(0.05, 0.0))
+    np.testing.assert_allclose(SupportCost(area).compute(e), [3.0 * 0.2**2])
+
+
 @pytest.mark.parametrize("acceleration, tips", [(0.0, False), (2.0, False), (4.0, True)])
 def test_braking_hard_tips_the_robot(acceleration, tips):
     """A centre of mass 1 m up over the middle: tipping begins at g times 0.25 m / 1 m."""
@@ -502,3 +519,19 @@ def test_a_sample_costs_the_same_alone(cost):
         },
     )
     np.testing.assert_allclose(cost.compute(alone), cost.compute(e)[2:3])
+
+
+# -- the documentation ---------------------------------------------------------------------
+
+
+def test_the_documented_defaults_are_the_real_ones():
+    """docs/retargeter.md, table of the terms: `name` in the fourth column from the end."""
+    text = (Path(__file__).parents[1] / "docs" / "retargeter.md").read_text()
+    documented = {}
+    for row in text.splitlines():
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        if row.startswith("|") and len(cells) == 6 and cells[2].startswith("`"):
+            documented[cells[2].split("`")[1]] = float(cells[4])
+    defaults = CostWeights()
+    actual = {f.name: getattr(defaults, f.name) for f in dataclasses.fields(CostWeights)}
+    assert documented == actual, "bring docs/retargeter.md up to date with CostWeights"

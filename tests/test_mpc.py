@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -17,7 +18,7 @@ from xop_lerobot.morphology.scene import add_block, add_floor, build_model
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
@@ -376,3 +377,79 @@ def test_the_goal_is_carried_on_at_its_velocity(bench):
             quat_from_yaw(0.5 * held), quat_rotate(start[3:], np.array([1.0, 0, 0]))
         )
         np.testing.assert_allclose(ahead, expected, atol=1e-9)
+
+
+class ManyKnots(RBY1):
+    """RB-Y1 with several knots, and noise where nothing may act."""
+
+    def mpc_config(self, mode: Mode) -> MpcConfig:
+        noise = {"v": 0.2, "torso_5": 0.1}
+        return MpcConfig(num_samples=6, horizon=10, noise_std=noise, num_knots=4)
+
+
+@pytest.fixture
+def many_knots():
+    b = Bench(ManyKnots(), RetargeterConfig(threads=1))
+    yield b
+    b.close()
+
+
+def test_noise_on_what_does_not_act_is_masked(many_knots):
+    plan = many_knots.tick(many_knots.make_goal(Mode.STATIONARY, (0.5, 0, 0), 0.5))
+    np.testing.assert_array_equal(plan.commands[:, :2], 0)
+    assert np.ptp(plan.commands[:, -1]) > 0  # several knots: it varies over the horizon
+
+
+def test_a_plan_goes_on_where_the_last_one_was(many_knots):
+    """The standing plan is shifted by the time that has passed on the robot's clock."""
+    b = many_knots
+    planner = b.retargeter._planners[Mode.MOBILE]
+    goal = b.make_goal(Mode.MOBILE, (0.1, 0, 0), 0.2)
+    b.tick(goal)  # two control steps pass
+    planner.knots = planner.knots + 0.1 * np.arange(4)[:, None]
+    before, sampled = planner.commands, []
+    sample = planner.sample
+
+    def watch(*args):
+        sampled.append(sample(*args))
+        return sampled[-1]
+
+    planner.sample = watch
+    b.tick(goal)
+    shifted = sampled[0].commands[0]  # the first sample is the standing plan
+    # At the knots, that is; between them the kernel of four knots ripples.
+    np.testing.assert_allclose(shifted[[0, 3, 6], 0], before[[2, 5, 8], 0], atol=1e-9)
+    assert np.abs(before[2:9, 0] - before[:7, 0]).max() > 0.05
+
+
+def test_a_goal_that_runs_away_is_held_near(bench):
+    b = bench("rby1")
+    reach = b.retargeter.configs[Mode.MOBILE].reach
+    commands = []
+    for distance in (reach + 0.01, 50.0):
+        b.retargeter.reset(b.loop.state)
+        goal = b.make_goal(Mode.MOBILE, (distance, 0, 0))
+        commands.append(b.retargeter.plan(b.loop.state, goal).command)
+    np.testing.assert_allclose(commands[0], commands[1], atol=1e-6)
+
+
+# -- the documentation ---------------------------------------------------------------------
+
+
+def test_the_documented_parameters_are_the_real_ones():
+    """docs/retargeter.md, table of the parameters: one row each, G1 and RB-Y1, both modes."""
+    text = (Path(__file__).parents[1] / "docs" / "retargeter.md").read_text()
+    configs = [make_morphology(name).mpc_config(mode) for name in POLICIES for mode in Mode]
+    seen = 0
+    for row in text.splitlines():
+        cells = [cell.strip() for cell in row.strip("|").split("|")]
+        if not row.startswith("| `") or len(cells) != 5:
+            continue
+        path = cells[0].split("`")[1].split(".")
+        for config, cell in zip(configs, cells[1:], strict=True):
+            value = config
+            for name in path:
+                value = getattr(value, name)
+            assert float(cell) == value, f"docs/retargeter.md: {cells[0]} of {config}"
+            seen += 1
+    assert seen >= 24

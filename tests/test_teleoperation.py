@@ -238,6 +238,20 @@ def test_a_lost_hand_does_not_end_the_engagement(rig):
     )
 
 
+def test_each_engagement_plans_from_the_command_that_is_executed(rig, monkeypatch):
+    r, starts = rig("rby1"), []
+    monkeypatch.setattr(r.teleop.retargeter, "reset", lambda state: starts.append(state.time))
+    expected = [r.loop.state.time]
+    r.run(0.2)
+    r.person.motion = lambda t: None
+    r.run(0.2)
+    assert r.teleop._plan is None
+    expected.append(r.loop.state.time)
+    r.person.motion = stand
+    r.run(0.2)
+    assert starts == expected
+
+
 @robots
 def test_reset_starts_over(rig, name):
     r = rig(name)
@@ -280,7 +294,7 @@ def test_the_mode_of_the_device_counts_over_gestures(rig):
 
 def test_a_change_of_mode_is_planned_for_at_once(rig):
     r = rig("rby1", fps=50, retargeter=dataclasses.replace(SMALL, control_hz=10.0))
-    r.run(0.1)
+    r.run(0.04)  # the next plan is due in three ticks
     r.person.motion = lambda t: make_frame(t, mode=Mode.MOBILE)
     _, record = r.tick()
     assert record.health["plan_age"] == 0
@@ -358,7 +372,10 @@ def test_plans_are_made_at_their_own_rate(rig, fps, control_hz, every):
 def test_between_two_plans_the_last_one_is_played_out(rig):
     r = rig("rby1", fps=50, retargeter=dataclasses.replace(SMALL, control_hz=10.0))
     r.tick()
-    plan = r.teleop._plan
+    steps = np.arange(4)[:, None]
+    plan = r.teleop._plan = dataclasses.replace(
+        r.teleop._plan, commands=r.teleop._plan.commands + 0.001 * steps
+    )
     for k in range(1, 5):
         _, record = r.tick()
         assert r.teleop._plan is plan

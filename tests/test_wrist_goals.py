@@ -54,7 +54,7 @@ def test_at_the_goal_the_wrists_are_where_the_operator_has_them():
     np.testing.assert_allclose(wrists["right_wrist"], RIGHT, atol=1e-12)
 
 
-@given(st.tuples(*[st.floats(-0.08, 0.08)] * 3).map(np.array), st.floats(-0.05, 0.05))
+@given(st.tuples(*[st.floats(-0.06, 0.06)] * 3).map(np.array), st.floats(-0.05, 0.05))
 def test_a_swaying_head_does_not_move_the_hands(offset, yaw):
     wrists = compute_wrist_goals(GOALS, move(HEAD, offset, yaw))
     for name in wrists:
