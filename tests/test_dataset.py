@@ -403,6 +403,7 @@ def test_an_empty_dataset_does_not_stay(session, pair, tmp_path):
     robot, teleop = pair
     dataset = create(session, robot, tmp_path / "data")
     tick(robot, teleop, dataset)
+    assert dataset, "lerobot-record finalizes its dataset `if dataset`, be it empty or not"
     dataset.finalize()
     assert not (tmp_path / "data").exists()
 

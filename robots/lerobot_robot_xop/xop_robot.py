@@ -14,6 +14,7 @@ from xop_lerobot.dataset.body import Body
 from xop_lerobot.errors import NotConnected, UnknownName
 from xop_lerobot.link import RobotInfo, get_session
 from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.mistakes import report_mistakes
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_scene_spec
 
@@ -44,6 +45,7 @@ class XopRobot(Robot):
 
     def __init__(self, config: XopRobotConfig) -> None:
         super().__init__(config)
+        report_mistakes()
         self.config = config
         self.morphology = make_morphology(config.morphology)
         _check_cameras(self.morphology, config)

@@ -12,6 +12,7 @@ from lerobot_teleoperator_xop.config_xop import XopConfig
 from xop_lerobot.dataset.host import Host
 from xop_lerobot.errors import LinkError, NotConnected
 from xop_lerobot.link import RobotInfo, get_session
+from xop_lerobot.mistakes import report_mistakes
 from xop_lerobot.operator.devices import make_device
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class Xop(Teleoperator):
 
     def __init__(self, config: XopConfig) -> None:
         super().__init__(config)
+        report_mistakes()
         self.config = config
         self._session = get_session(config.session)
         self._teleoperation: Teleoperation | None = None

@@ -190,6 +190,10 @@ class XopDataset(LeRobotDataset):
         # An instance attribute, so that other datasets of the process are untouched.
         self.meta.save_episode = save_with_facts
 
+    def __bool__(self) -> bool:
+        """True even while it is empty: `lerobot-record` finalizes its dataset `if dataset`."""
+        return True
+
     # The episode, as LeRobot's loops drive it.
 
     @property

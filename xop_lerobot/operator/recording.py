@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
+from zipfile import BadZipFile, is_zipfile
 
 import numpy as np
+from numpy.lib.format import MAGIC_PREFIX
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadRecording
@@ -82,11 +83,17 @@ def load_recording(path: str | Path) -> Recording:
         raise BadRecording(path, "it is a directory, but no dataset (there is no meta/info.json)")
     if not path.is_file():
         raise BadRecording(path, "there is no such file")
+    if not is_zipfile(path):
+        with path.open("rb") as file:
+            is_array = file.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX
+        raise BadRecording(
+            path,
+            "it is a single array, not an .npz archive"
+            if is_array
+            else "it is not a readable .npz archive, as np.savez writes it",
+        )
     try:
-        archive = np.load(path, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise BadRecording(path, "it is a single array, not an .npz archive")
-        with archive:
+        with np.load(path, allow_pickle=False) as archive:
             # Foreign keys are neither needed nor read: they may hold what we refuse to unpickle.
             names = [key for key in (*REQUIRED_KEYS, *OPTIONAL_KEYS) if key in archive.files]
             missing = [key for key in REQUIRED_KEYS if key not in names]

@@ -124,7 +124,8 @@ def load_script(name: str) -> Script:
     try:
         content = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise BadScript(path, f"it is not readable YAML ({error})") from error
+        fault = " ".join(str(error).split())
+        raise BadScript(path, f"it is not readable YAML ({fault})") from error
     return make_script(content, path)
 
 
