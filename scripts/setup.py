@@ -32,6 +32,8 @@ PIP = "pip==26.3"
 DISTRIBUTION = "lerobot_teleoperator_xop"
 NEEDED_GB = 8.0
 """Room for `.venv` (6.4 GB) and the archives on their way into it [GB]."""
+UNLOADABLE = "torchcodec"
+"""Taken out of `.venv` where it can't load; its pin stays."""
 HEARTBEAT_S = 20.0
 """Period of a sign of life where the output is no terminal [s]."""
 TAIL_LINES = 25
@@ -293,7 +295,8 @@ def run_pip(*arguments: str) -> None:
     Raises:
         SetupError: If it fails; carries the end of its output.
     """
-    command = (str(PYTHON), "-I", "-m", "pip", *arguments, "--no-input", "--progress-bar=off")
+    options = ["--no-input"] + ["--progress-bar=off"] * (arguments[0] == "install")
+    command = (str(PYTHON), "-I", "-m", "pip", *arguments, *options)
     if run_logged(command, "starting pip", make_clean_environment()) != 0:
         raise SetupError(
             f"pip failed:\n{read_tail()}\nThe whole log is {LOG}. Run the same command again "
@@ -325,6 +328,19 @@ def check_rendering() -> None:
             f"MuJoCo can't render with MUJOCO_GL={backend}: {fault}\nTry: sudo {command}\n"
             "or go on without cameras: MUJOCO_GL=disabled"
         )
+
+
+def drop_unloadable_torchcodec() -> None:
+    """Remove torchcodec where it can't load, as on a machine without FFmpeg's libraries.
+
+    LeRobot then decodes videos with PyAV, as it would anyhow, but without a hundred lines of
+    tracebacks at each start.
+    """
+    loaded = subprocess.run(
+        [PYTHON, "-I", "-c", "import torchcodec"], capture_output=True, check=False
+    )
+    if loaded.returncode != 0:
+        run_pip("uninstall", "--yes", UNLOADABLE)
 
 
 @contextmanager
@@ -369,6 +385,7 @@ def install_all() -> None:
         install_system_packages(gl, compiler)
     run_pip("install", PIP)
     run_pip("install", "-c", str(LOCK_FILE), "-e", f"{ROOT}[dev]")
+    drop_unloadable_torchcodec()
     check_rendering()
 
 
@@ -381,8 +398,12 @@ def write_lock() -> None:
         text=True,
         check=True,
     ).stdout
-    comment = [line for line in LOCK_FILE.read_text().splitlines() if line.startswith("#")]
+    before = LOCK_FILE.read_text().splitlines()
+    comment = [line for line in before if line.startswith("#")]
     pins = [line for line in frozen.splitlines() if "==" in line]
+    if not any(line.startswith(f"{UNLOADABLE}==") for line in pins):
+        pins += [line for line in before if line.startswith(f"{UNLOADABLE}==")]
+    pins.sort(key=str.lower)
     LOCK_FILE.write_text("\n".join([*comment, *pins, ""]))
     say(f"{LOCK_FILE}: {len(pins)} versions")
 

@@ -277,6 +277,35 @@ def test_a_failing_pip_shows_the_end_of_its_output(
     del capsys
 
 
+@pytest.mark.parametrize("loads", [True, False])
+def test_torchcodec_stays_where_it_loads(
+    setup: ModuleType, monkeypatch: pytest.MonkeyPatch, loads: bool
+) -> None:
+    setup.PYTHON.parent.mkdir(parents=True)
+    setup.PYTHON.write_text(f"#!/bin/sh\nexit {0 if loads else 1}\n")
+    setup.PYTHON.chmod(0o755)
+    calls: list[tuple[str, ...]] = []
+    monkeypatch.setattr(setup, "run_pip", lambda *arguments: calls.append(arguments))
+    setup.drop_unloadable_torchcodec()
+    assert calls == ([] if loads else [("uninstall", "--yes", "torchcodec")])
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_the_lock_keeps_the_pin_of_what_was_dropped(
+    setup: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, installed: bool
+) -> None:
+    lock = tmp_path / "requirements.lock"
+    lock.write_text("# A comment.\nnumpy==1.0\ntorchcodec==0.1\ngone==3.0\n")
+    monkeypatch.setattr(setup, "LOCK_FILE", lock)
+    frozen = "numpy==2.0\n" + ("torchcodec==0.2\n" if installed else "") + "Zarr==1.0\n"
+    setup.PYTHON.parent.mkdir(parents=True)
+    setup.PYTHON.write_text(f"#!/bin/sh\nprintf '{frozen}'\n")
+    setup.PYTHON.chmod(0o755)
+    setup.write_lock()
+    codec = "torchcodec==0.2" if installed else "torchcodec==0.1"
+    assert lock.read_text() == f"# A comment.\nnumpy==2.0\n{codec}\nZarr==1.0\n"
+
+
 def test_pip_lines_are_told_in_plain_words(setup: ModuleType) -> None:
     describe = setup.describe_line
     assert describe("Collecting torch<2.12.0 (from lerobot)\n") == "collecting torch<2.12.0"
@@ -299,7 +328,8 @@ def test_pip_sees_nothing_of_another_python(
 def test_the_lock_pins_every_dependency_and_no_broken_mujoco() -> None:
     lines = (ROOT / "requirements.lock").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
-    assert {"mujoco", "lerobot", "mink", "daqp", "torch", "pytest", "ruff"} <= set(pins)
+    assert {"mujoco", "lerobot", "mink", "daqp", "torch", "accelerate", "pytest"} <= set(pins)
+    assert pins["lerobot"] == "0.6.1"
     assert int(pins["mujoco"].split(".")[0]) < 4, "4.0.0 has a wrong sparse Newton Hessian"
     assert not any("xop" in name for name in pins)
 
