@@ -17,7 +17,7 @@ from xop_lerobot.state import FRAMES, RobotState
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 COST_NAMES = (
-    "tracking", "stance", "collision", "control", "terminal", "support", "fall", "total",
+    "tracking", "stance", "collision", "control", "terminal", "support", "lateral", "fall", "total",
 )  # fmt: skip
 """Terms of `retargeter.cost`; a term that a retargeter does not have is 0."""
 HEALTH_NAMES = ("solve_time", "plan_age", "effective_samples", "sync_residual")

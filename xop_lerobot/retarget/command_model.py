@@ -43,6 +43,12 @@ class CommandModel:
         acts = np.array([mode in effect.modes for effect in self.effects])
         return acts & ~(self.space.mobile_only & (mode == Mode.STATIONARY))
 
+    @property
+    def is_nonholonomic(self) -> bool:
+        """Whether the base drives forward but not sideways."""
+        acts = {effect.acts for effect in self.effects}
+        return Acts.FORWARD in acts and Acts.LEFT not in acts
+
     def is_velocity(self) -> np.ndarray:
         """Which entries are velocities of the base. Shape (k,), bool."""
         return np.array([effect.acts in _TWIST for effect in self.effects])
@@ -55,6 +61,15 @@ class CommandModel:
                 twist[..., _TWIST.index(effect.acts)] += command[..., i]
         return twist
 
+    def _ramp(self, command: np.ndarray, executed: np.ndarray, dt: float) -> np.ndarray:
+        """What the rate limits make of a command: its mean for velocities, its end for the rest."""
+        rate = self.space.max_rate
+        wanted = command - executed
+        reached = executed + np.clip(wanted, -rate * dt, rate * dt)
+        ramp = np.minimum(np.abs(wanted) / rate, dt) / dt  # share of the time spent on the ramp
+        mean = reached - (reached - executed) * ramp / 2
+        return np.where(self.is_velocity(), mean, reached)
+
     def extrapolate(
         self,
         qpos: np.ndarray,
@@ -62,6 +77,7 @@ class CommandModel:
         dt: float,
         mode: Mode,
         drift: np.ndarray | None = None,
+        executed: np.ndarray | None = None,
     ) -> np.ndarray:
         """Compute the configuration after `dt` of a command.
 
@@ -71,11 +87,15 @@ class CommandModel:
             dt: How long [s].
             mode: Mode of the robot; only what acts in it has an effect.
             drift: Base velocity beyond the commanded one, as `compute_twist`. Shape (3,).
+            executed: Command executed now, from which the robot ramps at its rate limits to
+                `command`; None where the command is executed already. Shape (..., k).
 
         Returns:
             Configurations then. Shape (..., nq).
         """
         shape = np.broadcast_shapes(qpos.shape[:-1], command.shape[:-1])
+        if executed is not None:
+            command = self._ramp(command, executed, dt)
         result = np.broadcast_to(qpos, (*shape, qpos.shape[-1])).copy()
         for i, (effect, acts) in enumerate(zip(self.effects, self.acting(mode), strict=True)):
             if acts and effect.acts not in _TWIST:

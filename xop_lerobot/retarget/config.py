@@ -26,6 +26,9 @@ class CostWeights:
             scale [1].
         terminal: w_f, factor on the tracking cost at the end of the horizon [1].
         support: Squared distance of the zero-moment point out of the safe support area [1/m²].
+        lean: Squared distance of the centre of mass from where it rests on the base [1/m²].
+        lateral: Squared part of the wanted velocity across the heading of a base on wheels
+            [s²/m²].
         fall: Squared tilt of the base over the safe one, and height under it [1].
     """
 
@@ -39,6 +42,8 @@ class CostWeights:
     terminal: float = 2.0
     fall: float = 100.0
     support: float = 1000.0
+    lean: float = 0.0
+    lateral: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,8 @@ class MpcConfig:
         control_hz: Solves per second of the robot's clock [Hz].
         preview_s: Time over which a goal is assumed to keep its velocity [s].
         extrapolation_s: Time over which the terminal state is extrapolated [s].
+        reach: Distance at which a goal that runs away is held [m]; beyond it more error would
+            only contort the robot.
         proposal_s: Time in which the kinematic candidate wants to be at the goal [s].
         weights: Cost weights.
     """
@@ -77,6 +84,7 @@ class MpcConfig:
     preview_s: float = 0.3
     extrapolation_s: float = 0.4
     proposal_s: float = 0.6
+    reach: float = 0.6
     weights: CostWeights = field(default_factory=CostWeights)
 
     def __post_init__(self) -> None:

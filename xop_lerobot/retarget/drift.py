@@ -49,7 +49,12 @@ class DriftObserver:
             command: Command. Shape (k,).
             moving: Whether the base follows velocities at all; if not, there is no drift.
         """
-        planar = np.array([qpos[0], qpos[1], quat_yaw(qpos[3:7])])
+        if not np.isfinite(qpos[:7]).all():
+            return
+        yaw = float(quat_yaw(qpos[3:7]))
+        # The point about which the base turns: turning alone does not move it.
+        pivot = self.command_model.pivot * np.array([np.cos(yaw), np.sin(yaw)])
+        planar = np.array([*(qpos[:2] + pivot), yaw])
         last, self._last = self._last, (time, planar)
         if not moving:
             self.drift, self._expected = np.zeros(3), np.zeros(3)

@@ -98,7 +98,8 @@ class Kmppi:
     def update(self, samples: Samples, costs: np.ndarray) -> np.ndarray:
         """Move the plan to the weighted mean of the samples. Returns the weights, shape (K,)."""
         weights = compute_weights(costs, self.config)
-        self.knots = np.tensordot(weights, samples.knots, axes=1)
+        used = weights > 0  # a sample that is not finite must not get in with weight 0
+        self.knots = np.tensordot(weights[used], samples.knots[used], axes=1)
         return weights
 
 
@@ -123,7 +124,7 @@ def compute_weights(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
         return weights
     excess = np.where(finite, costs - costs[finite].min(), np.inf)
     span = excess[finite].max()
-    if span <= 0:
+    if span <= np.finfo(float).tiny:
         return finite / finite.sum()
     if config.weighting == "raw":
         return _softmin(excess, config.temperature)

@@ -20,6 +20,7 @@ from xop_lerobot.retarget.costs import (
     Cost,
     Evaluation,
     FallCost,
+    LateralCost,
     StanceCost,
     SupportArea,
     SupportCost,
@@ -29,7 +30,7 @@ from xop_lerobot.retarget.costs import (
 from xop_lerobot.retarget.costs.collision import make_obstacles
 from xop_lerobot.retarget.drift import DriftObserver
 from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.retarget.kmppi import Kmppi, compute_effective_samples
+from xop_lerobot.retarget.kmppi import Kmppi, Samples, compute_effective_samples
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
 from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
@@ -71,12 +72,15 @@ class MpcRetargeter(Retargeter):
         obstacles = make_obstacles(model)
         hull = morphology.hull_points if obstacles else {}
         self._points = tuple(dict.fromkeys((*morphology.contact_points, *hull)))
-        self.support = SupportArea(morphology.support) if morphology.support else None
         self.kinematics = SiteKinematics(
             model,
             (*self.sites.values(), *self._points),
-            com_of=morphology.base_body if self.support else None,
+            com_of=morphology.base_body if morphology.support else None,
         )
+        self.support = None
+        if morphology.support:
+            resting = self.kinematics.compute_com(morphology.standing_qpos())
+            self.support = SupportArea(morphology.support, tuple(resting[:2]))
         self.proposals = {
             mode: KinematicProposal(
                 self.command_model,
@@ -95,6 +99,7 @@ class MpcRetargeter(Retargeter):
             CollisionCost(obstacles, hull),
             ControlCost((self.space.high - self.space.low) / 2),
             SupportCost(self.support),
+            LateralCost(self.command_model.is_nonholonomic),
             FallCost(morphology.fall_tilt, morphology.fall_height, standing_height),
         )
         self.cost_names = tuple(cost.name for cost in self.costs)
@@ -104,6 +109,9 @@ class MpcRetargeter(Retargeter):
             mode: Kmppi(self.configs[mode].horizon, self.space.low, self.space.high, each)
             for mode, each in self.configs.items()
         }
+        for each in self.configs.values():
+            for name in each.noise_std:
+                self.space.index(name)  # a misspelt name must not mean no noise
         self._noise = {
             mode: np.array([each.noise_std.get(name, 0.0) for name in self.space.names])
             * self.command_model.acting(mode)
@@ -134,19 +142,23 @@ class MpcRetargeter(Retargeter):
         mode, config, planner = goal.mode, self.configs[goal.mode], self._planners[goal.mode]
         self._warm_start(state, mode)
         self.drift.update(state.time, state.qpos, state.command, mode is Mode.MOBILE)
+        goal = self._hold_near(state, goal, config.reach)
         ahead = np.arange(config.horizon + 1) * POLICY_DT
         goals = self._preview(goal, ahead, config)
+        then = self._preview(goal, np.array([config.proposal_s]), config)
+        wanted = self._compute_wanted_velocity(state, then, config)
         proposal = self.proposals[mode].solve(
             state.qpos,
-            {
-                name: poses[0]
-                for name, poses in self._preview(goal, _at(config.proposal_s), config).items()
-            },
+            {name: poses[0] for name, poses in then.items()},
             mode,
             config.proposal_s,
             start=planner.commands[0],
             drift=self.drift.drift,
+            executed=state.command,
+            wanted_velocity=wanted,
         )
+        if not np.isfinite(proposal).all():
+            proposal = state.command
         candidates = np.stack([proposal, state.command, self.space.neutral])
         acting = self.command_model.acting(mode)
         candidates = np.where(acting, candidates, self.space.neutral)
@@ -155,10 +167,16 @@ class MpcRetargeter(Retargeter):
         sampled = perf_counter()
 
         prediction = self.rollout.predict(
-            state.qpos, state.qvel, state.memory, samples.commands, state.arms, mode
+            state.qpos,
+            state.qvel,
+            state.memory,
+            self._limit_rates(state.command, samples.commands),
+            state.arms,
+            mode,
         )
         rolled = perf_counter()
-        terms = self._evaluate(prediction, goals, goal, proposal, config)
+        with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
+            terms = self._evaluate(prediction, samples, goals, goal, proposal, wanted, config)
         costs = np.sum(list(terms.values()), axis=0)
         weights = planner.update(samples, costs)
         best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
@@ -187,9 +205,23 @@ class MpcRetargeter(Retargeter):
         """Shift the last plan by the time that has passed, or start from the executed command."""
         planner = self._planners[mode]
         if self._last is None or self._last[1] is not mode:
-            planner.reset(state.command)
+            acting = self.command_model.acting(mode)
+            planner.reset(np.where(acting, state.command, self.space.neutral))
         else:
             planner.shift(max(0.0, state.time - self._last[0]) / POLICY_DT)
+
+    def _hold_near(self, state: RobotState, goal: Goal, reach: float) -> Goal:
+        """Move goals that are further than `reach` [m] aside of their frame up to that distance."""
+        poses = self.kinematics.compute_poses(state.qpos, tuple(self.sites.values()))
+        near = dict(goal.poses)
+        for name in self.frames:
+            if name in near:
+                position = poses[self.sites[name]][:3]
+                offset = near[name][:3] - position
+                share = min(1.0, reach / max(float(np.linalg.norm(offset[:2])), 1e-9))
+                held = position + np.array([share, share, 1.0]) * offset
+                near[name] = make_pose(held, near[name][3:])
+        return dataclasses.replace(goal, poses=near)
 
     def _preview(self, goal: Goal, ahead: np.ndarray, config: MpcConfig) -> dict[str, np.ndarray]:
         """Goals `ahead` seconds from now, at constant velocity up to `preview_s`."""
@@ -203,6 +235,25 @@ class MpcRetargeter(Retargeter):
             quat = quat_multiply(quat_exp(times * velocity[3:]), pose[3:])
             goals[name] = make_pose(position, quat)
         return goals
+
+    def _limit_rates(self, executed: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """What the robot will make of command sequences. Shapes (k,), (K, H, k)."""
+        step = self.space.max_rate * POLICY_DT
+        limited = np.empty_like(commands)
+        for k in range(commands.shape[1]):
+            executed = np.clip(commands[:, k], executed - step, executed + step)
+            limited[:, k] = executed
+        return limited
+
+    def _compute_wanted_velocity(
+        self, state: RobotState, then: Mapping[str, np.ndarray], config: MpcConfig
+    ) -> np.ndarray:
+        """Velocity that takes the first tracked frame to its goal in time [m/s]. Shape (2,)."""
+        for name, poses in then.items():
+            site = self.sites[name]
+            here = self.kinematics.compute_positions(state.qpos, (site,))[site]
+            return (poses[0, :2] - here[:2]) / config.proposal_s
+        return np.zeros(2)
 
     def _noise_share(
         self, state: RobotState, goals: Mapping[str, np.ndarray], config: MpcConfig
@@ -219,19 +270,22 @@ class MpcRetargeter(Retargeter):
     def _evaluate(
         self,
         prediction: Prediction,
+        samples: Samples,
         goals: Mapping[str, np.ndarray],
         goal: Goal,
         reference: np.ndarray,
+        wanted: np.ndarray,
         config: MpcConfig,
     ) -> dict[str, np.ndarray]:
         """Cost of every sample by term. Shapes (K,)."""
         sites = {name: self.sites[name] for name in goals}
         extrapolated = self.command_model.extrapolate(
             prediction.qpos[:, -1],
-            prediction.commands[:, -1],
+            samples.commands[:, -1],
             config.extrapolation_s,
             goal.mode,
             self.drift.drift,
+            executed=prediction.commands[:, -1],
         )
         terminal = self.kinematics.compute_poses(extrapolated, tuple(sites.values()))
         poses = self.kinematics.compute_poses(prediction.qpos, tuple(sites.values()))
@@ -243,7 +297,7 @@ class MpcRetargeter(Retargeter):
         evaluation = Evaluation(
             qpos=prediction.qpos,
             qvel=prediction.qvel,
-            commands=prediction.commands,
+            commands=samples.commands,
             reference=reference,
             poses={name: poses[site] for name, site in sites.items()},
             points=self.kinematics.compute_positions(prediction.qpos, self._points),
@@ -255,6 +309,7 @@ class MpcRetargeter(Retargeter):
             terminal_goals={
                 name: poses[0] for name, poses in self._preview(goal, _at(last), config).items()
             },
+            wanted_velocity=wanted,
             mode=goal.mode,
             dt=POLICY_DT,
             weights=config.weights,

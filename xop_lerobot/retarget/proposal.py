@@ -11,6 +11,7 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.config import CostWeights
+from xop_lerobot.retarget.costs.lateral import compute_lateral
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.transforms import heading_error
@@ -27,19 +28,25 @@ class ProposalWeights:
         orientation: Of roll, pitch and heading, as in `heading_error` [1/rad].
         effort: Of the command's distance from neutral, over its scale [1].
         support: Of the centre of mass beyond the support area [1/m].
+        lean: Of the centre of mass from where it rests on the base [1/m].
+        lateral: Of the wanted velocity across the heading of a base on wheels [s/m].
     """
 
     position: tuple[float, float, float] = (1.0, 1.0, 1.0)
     orientation: tuple[float, float, float] = (0.4, 0.4, 0.4)
     effort: float = 0.02
     support: float = 30.0
+    lean: float = 0.0
+    lateral: float = 0.0
 
 
 def make_proposal_weights(weights: CostWeights) -> ProposalWeights:
     """Weights of the least squares that match those of the tracking cost."""
     turn = math.sqrt(weights.orientation / weights.position)
     tilt = turn * math.sqrt(weights.tilt_share)
-    return ProposalWeights(orientation=(tilt, tilt, turn))
+    lean = math.sqrt(weights.lean / weights.position)
+    lateral = math.sqrt(weights.lateral / weights.position)
+    return ProposalWeights(orientation=(tilt, tilt, turn), lean=lean, lateral=lateral)
 
 
 class KinematicProposal:
@@ -83,6 +90,8 @@ class KinematicProposal:
         *,
         start: np.ndarray | None = None,
         drift: np.ndarray | None = None,
+        executed: np.ndarray | None = None,
+        wanted_velocity: np.ndarray | None = None,
         free: np.ndarray | None = None,
     ) -> np.ndarray:
         """Compute the proposed command.
@@ -94,6 +103,8 @@ class KinematicProposal:
             dt: Time to get there [s].
             start: Where to start the iteration; neutral by default. Shape (k,).
             drift: Base velocity beyond the commanded one. Shape (3,).
+            executed: Command executed now, from which the robot ramps. Shape (k,).
+            wanted_velocity: Velocity that a base on wheels shall be able to give [m/s]. (2,).
             free: Which entries may move; all that act by default. Shape (k,), bool.
 
         Returns:
@@ -105,12 +116,21 @@ class KinematicProposal:
         command = np.where(free, space.neutral if start is None else start, space.neutral)
         if not len(index) or not goals:
             return command
-        low, high = space.low[index], space.high[index]
+        low, high = space.low, space.high
+        if executed is not None:  # beyond what can be reached in time nothing would change
+            low = np.maximum(low, executed - space.max_rate * dt)
+            high = np.minimum(high, executed + space.max_rate * dt)
+        low, high = low[index], high[index]
+        command[index] = np.clip(command[index], low, high)
         scale, effort = self.scale[index], self._effort[index]
+        def compute_residuals(commands: np.ndarray) -> np.ndarray:
+            future = self.command_model.extrapolate(qpos, commands, dt, mode, drift, executed)
+            return self._compute_residuals(future, goals, wanted_velocity)
+
         for _ in range(self.iterations):
             batch = np.tile(command, (len(index) + 1, 1))
             batch[np.arange(1, len(index) + 1), index] += _STEP * scale
-            residuals = self._compute_residuals(qpos, batch, goals, mode, dt, drift)
+            residuals = compute_residuals(batch)
             jacobian = (residuals[1:] - residuals[0]).T / _STEP  # per share of scale
             pull = np.square(effort) * (command[index] - space.neutral[index]) / scale
             matrix = jacobian.T @ jacobian + np.diag(np.square(effort) + 1e-6)
@@ -124,15 +144,11 @@ class KinematicProposal:
 
     def _compute_residuals(
         self,
-        qpos: np.ndarray,
-        commands: np.ndarray,
+        future: np.ndarray,
         goals: Mapping[str, np.ndarray],
-        mode: Mode,
-        dt: float,
-        drift: np.ndarray | None,
+        wanted_velocity: np.ndarray | None,
     ) -> np.ndarray:
-        """Weighted pose errors of a batch of commands. Shape (n, 6 · frames)."""
-        future = self.command_model.extrapolate(qpos, commands, dt, mode, drift)
+        """Weighted errors of a batch of extrapolated configurations. Shape (n, residuals)."""
         poses = self.kinematics.compute_poses(future, tuple(self.sites[name] for name in goals))
         parts = []
         for name, goal in goals.items():
@@ -141,7 +157,12 @@ class KinematicProposal:
             parts.append(-heading_error(goal[3:], pose[:, 3:]) * self.weights.orientation)
         if self.support is not None:
             com = self.kinematics.compute_com(future)[:, :2]
-            parts.append(self.weights.support * self.support.compute_excess(future[:, :7], com))
+            base = future[:, :7]
+            parts.append(self.weights.support * self.support.compute_excess(base, com))
+            parts.append(self.weights.lean * self.support.compute_lean(base, com))
+        if self.command_model.is_nonholonomic and wanted_velocity is not None:
+            lateral = compute_lateral(future[:, :7], wanted_velocity)
+            parts.append(self.weights.lateral * lateral[:, None])
         return np.concatenate(parts, axis=1)
 
 

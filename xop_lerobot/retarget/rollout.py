@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from time import perf_counter
 from typing import NamedTuple
 
@@ -12,6 +13,8 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+
+_DIVERGED = 1e4  # no position [m, rad] or velocity [m/s, rad/s] of a sound prediction is as large
 
 
 class Prediction(NamedTuple):
@@ -47,7 +50,9 @@ class PolicyRollout:
     """
 
     def __init__(self, model: mujoco.MjModel, policy: LowLevelPolicy, num_threads: int) -> None:
-        self.model, self.policy = model, policy
+        # MuJoCo would put a diverged sample back to its start, where it looks healthy.
+        self.model, self.policy = copy.copy(model), policy
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.substeps = round(POLICY_DT / model.opt.timestep)
         if abs(self.substeps * model.opt.timestep - POLICY_DT) > 1e-9:  # noqa: PLR2004
             raise BadValue(
@@ -82,7 +87,7 @@ class PolicyRollout:
             mode: Mode of the low-level policy.
 
         Returns:
-            The predicted states.
+            The predicted states; NaN throughout for a sample that diverged.
         """
         nq, nv = self.model.nq, self.model.nv
         num_rollouts, horizon, _ = commands.shape
@@ -117,6 +122,7 @@ class PolicyRollout:
             end = perf_counter()
             policy_s += between - start
             physics_s += end - between
+        states[~(np.abs(states[..., 1:]) < _DIVERGED).all(axis=(1, 2))] = np.nan
         return Prediction(
             states[..., 1 : 1 + nq],
             states[..., 1 + nq : 1 + nq + nv],

@@ -4,6 +4,7 @@ from xop_lerobot.retarget.costs.collision import CollisionCost
 from xop_lerobot.retarget.costs.control import ControlCost
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.costs.fall import FallCost
+from xop_lerobot.retarget.costs.lateral import LateralCost
 from xop_lerobot.retarget.costs.stance import StanceCost
 from xop_lerobot.retarget.costs.support import SupportArea, SupportCost
 from xop_lerobot.retarget.costs.terminal import TerminalCost
@@ -15,6 +16,7 @@ __all__ = [
     "Cost",
     "Evaluation",
     "FallCost",
+    "LateralCost",
     "StanceCost",
     "SupportArea",
     "SupportCost",

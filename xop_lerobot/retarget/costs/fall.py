@@ -11,9 +11,9 @@ from xop_lerobot.transforms import quat_rotate
 class FallCost(Cost):
     r"""Mean over steps of :math:`w_{fall}(\max(0, \alpha - \alpha_s)^2 + \max(0, z_s - z)^2)`.
 
-    α is the tilt of the base and z its height; the safe values are those at which half the
-    margin to a fall is used up. It is zero in ordinary motion. The paper has no such term; its
-    predicted falls show up in the tracking cost alone.
+    α is the tilt of the base and z its height; the safe values are half the tilt, and the height
+    at which three quarters of the margin to a fall are used up. It is zero in ordinary motion.
+    The paper has no such term; its predicted falls show up in the tracking cost alone.
 
     Args:
         tilt: Tilt at which the robot counts as fallen [rad].

@@ -30,17 +30,15 @@ class StanceCost(Cost):
         """Cost of every sample. Shape (K,)."""
         if self.wheeled and evaluation.mode is Mode.MOBILE:
             return np.zeros(len(evaluation.qpos))
-        points = np.stack(
-            [
-                np.stack([evaluation.points[site] for site in group], axis=-2)
-                for group in self.groups
-            ]
-        )  # (groups, K, H + 1, points, 3)
-        speed = np.square(np.diff(points, axis=2) / evaluation.dt).sum(-1).mean(-1)
+        speeds, heights = [], []
+        for group in self.groups:
+            points = np.stack([evaluation.points[site] for site in group])  # (p, K, H + 1, 3)
+            speeds.append(np.square(np.diff(points, axis=2) / evaluation.dt).sum(-1).mean(0))
+            heights.append(points[:, :, 1:, 2].mean(0))
+        speed = np.stack(speeds)  # (groups, K, H)
         if evaluation.mode is Mode.STATIONARY:
             active = speed.sum(axis=0)
         else:
-            height = points[:, :, 1:, :, 2].mean(-1)
-            lowest = height.argmin(axis=0)[None]
+            lowest = np.stack(heights).argmin(axis=0)[None]
             active = np.take_along_axis(speed, lowest, axis=0)[0]
         return evaluation.weights.stance * active.mean(axis=1)

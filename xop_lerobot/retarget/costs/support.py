@@ -15,24 +15,39 @@ class SupportArea:
 
     Args:
         corners: Corners (x, y) in the base's frame, counterclockwise [m]. Shape (c, 2).
+        resting: Where the centre of mass is at rest, in the base's frame [m]. Shape (2,).
         margin: Distance that is kept from every edge [m].
     """
 
-    def __init__(self, corners: tuple[tuple[float, float], ...], margin: float = 0.1) -> None:
+    def __init__(
+        self,
+        corners: tuple[tuple[float, float], ...],
+        resting: tuple[float, float] = (0.0, 0.0),
+        margin: float = 0.1,
+    ) -> None:
         points = np.array(corners, dtype=float)
         edges = np.roll(points, -1, axis=0) - points
         normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)  # outwards
         self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         self._offsets = (self._normals * points).sum(1) - margin
+        self._resting = np.array(resting)
 
     def compute_excess(self, base: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Distances of points beyond each edge, 0 inside [m]. (..., 7), (..., 2) -> (..., c)."""
-        yaw = quat_yaw(base[..., 3:])
-        dx, dy = points[..., 0] - base[..., 0], points[..., 1] - base[..., 1]
-        local = np.stack(
-            [np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx], axis=-1
-        )
-        return np.maximum(local @ self._normals.T - self._offsets, 0)
+        return np.maximum(_to_base(base, points) @ self._normals.T - self._offsets, 0)
+
+    def compute_lean(self, base: np.ndarray, com: np.ndarray) -> np.ndarray:
+        """Place of the centre of mass from where it rests [m]. (..., 7), (..., 2) -> (..., 2)."""
+        return _to_base(base, com) - self._resting
+
+
+def _to_base(base: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points in the base's place and heading. (..., 7), (..., 2) -> (..., 2)."""
+    yaw = quat_yaw(base[..., 3:])
+    dx, dy = points[..., 0] - base[..., 0], points[..., 1] - base[..., 1]
+    return np.stack(
+        [np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx], axis=-1
+    )
 
 
 class SupportCost(Cost):
@@ -42,8 +57,10 @@ class SupportCost(Cost):
 
     with c the centre of mass and its acceleration the mean over the horizon, from finite
     differences; and at the end of the extrapolation, where the robot shall be able to stand
-    still, the centre of mass itself. On flat ground the robot tips where z leaves the area
-    (Vukobratović and Borovac, 2004). The paper has no such term.
+    still, the centre of mass itself. There its squared distance from where it rests counts too,
+    with the weight `lean`: a mobile robot shall drive after its goal, not bend. On flat ground
+    the robot tips where z leaves the area (Vukobratović and Borovac, 2004). The paper has no
+    such term.
 
     Args:
         area: The support area, None for a robot whose policy keeps the balance.
@@ -64,8 +81,8 @@ class SupportCost(Cost):
         acceleration = (velocity[:, -1] - velocity[:, 0]) / span
         zmp = com[..., :2] - com[..., 2:] / GRAVITY * acceleration[:, None]
         moving = self.area.compute_excess(evaluation.qpos[..., :7], zmp)
-        resting = self.area.compute_excess(
-            evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
-        )
+        base, com = evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
+        resting = self.area.compute_excess(base, com)
         excess = np.square(moving).sum(-1).mean(-1) + np.square(resting).sum(-1)
-        return evaluation.weights.support * excess
+        lean = np.square(self.area.compute_lean(base, com)).sum(-1)
+        return evaluation.weights.support * excess + evaluation.weights.lean * lean
