@@ -53,14 +53,17 @@ class RealtimeLoop:
         Raises:
             Exception: Whatever ended the loop's thread.
         """
-        if self._failure is not None:
-            raise self._failure
         with self._lock:
+            self._check()
             return self._loop.state
 
     def reset(self, seed: int | None = None, settle_s: float = 1.0) -> None:
-        """Put the robot at rest, let it settle (faster than the clock), then run."""
+        """Put the robot at rest, let it settle (faster than the clock), then run.
+
+        A failure of the loop's thread is forgotten.
+        """
         self._halt()
+        self._failure = None
         self._loop.reset(seed, settle_s)
         self._stop.clear()
         self._handed_over = time.monotonic()
@@ -68,8 +71,13 @@ class RealtimeLoop:
         self._thread.start()
 
     def execute(self, action: RobotAction, dt: float) -> RobotAction:
-        """Limit `action`, hand it over, and return what will be executed from now on."""
+        """Limit `action`, hand it over, and return what will be executed from now on.
+
+        Raises:
+            Exception: Whatever ended the loop's thread.
+        """
         with self._lock:
+            self._check()
             limited = limit_action(self.morphology, action, self._loop.action, dt)
             self._loop.action = limited
             self._handed_over = time.monotonic()
@@ -80,6 +88,11 @@ class RealtimeLoop:
         self._halt()
         self._loop.close()
 
+    def _check(self) -> None:
+        """Raise what ended the loop's thread."""
+        if self._failure is not None:
+            raise self._failure
+
     def _halt(self) -> None:
         self._stop.set()
         if self._thread is not None:
@@ -89,7 +102,7 @@ class RealtimeLoop:
     def _run(self) -> None:
         try:
             self._run_until_stopped()
-        except BaseException as failure:  # noqa: BLE001  shown to the caller in `state`
+        except BaseException as failure:  # noqa: BLE001  raised in the caller
             self._failure = failure
             logger.exception("the policy loop has ended")
 

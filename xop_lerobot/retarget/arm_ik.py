@@ -16,10 +16,12 @@ _MAX_DT = 0.05  # after a stall the arms move as after one late tick, not all at
 class ArmIk:
     """Differential inverse kinematics of the arms with mink, the rest of the body as measured.
 
-    Each solve starts from the targets sent last, not from the measured arms, so that sensor
-    noise and sagging never reach the targets. Joint limits, a joint speed limit and a distance
-    between the forearms and the rest of the body hold by construction; the posture term pulls
-    weakly towards the rest angles and keeps the elbows from drifting through the null space.
+    Each solve starts from its own last solution, not from the measured arms, so that sensor
+    noise and sagging never reach it. Joint limits and a joint speed limit hold by construction.
+    It keeps the forearms a distance from the rest of the body, except for what the servo lag
+    adds, and for what a single step misses, since each holds the distance to first order only.
+    The posture term pulls weakly towards the rest angles and keeps the elbows from drifting
+    through the null space.
 
     Args:
         morphology: The robot.
@@ -37,7 +39,10 @@ class ArmIk:
         model = morphology.build_spec("full").compile()
         joints = [joint for arm in morphology.arms for joint in arm.joints]
         self.num_joints = len(joints)
-        self._qpos = np.array([int(model.joint(joint).qposadr[0]) for joint in joints])
+        self.qpos_address = np.array([int(model.joint(joint).qposadr[0]) for joint in joints])
+        """Where the arm joints are in the robot's qpos. Shape (num_joints,), int."""
+        self.joint_range = np.array([model.joint(joint).range for joint in joints])
+        """Limits of the arm joints [rad]. Shape (num_joints, 2)."""
         dofs = [int(model.joint(joint).dofadr[0]) for joint in joints]
         self._configuration = mink.Configuration(model)
         self._tasks = {
@@ -56,8 +61,10 @@ class ArmIk:
         posture_cost[dofs] = 0.02
         self._posture = mink.PostureTask(model, posture_cost)
         self._rest = rest
-        frozen = sorted(set(range(model.nv)) - set(dofs))
-        self._constraints = [mink.DofFreezingTask(model, frozen)]
+        self._dofs = np.array(dofs)
+        frames = [arm.frame for arm in morphology.arms for _ in arm.joints]
+        self._owner = np.array(frames)  # frame that each joint's arm carries
+        self._freezing: dict[frozenset[str], mink.DofFreezingTask] = {}
         self._limits = [
             mink.ConfigurationLimit(model, gain=0.5),
             mink.VelocityLimit(model, dict.fromkeys(joints, max_speed)),
@@ -85,12 +92,12 @@ class ArmIk:
 
         Args:
             qpos: Configuration of the robot; its arm angles are not used. Shape (nq,).
-            arms: Arm joint targets sent last [rad]. Shape (num_joints,).
+            arms: The last solution [rad]. Shape (num_joints,).
             goals: Wanted pose in the world of each wrist; arms without a goal stay. Shapes (7,).
-            dt: Time since the last solve [s].
+            dt: Time since the last solve [s]; without any, nothing moves.
 
         Returns:
-            New targets within the limits. Shape (num_joints,).
+            New angles within the limits. Shape (num_joints,).
         """
         tasks: list[mink.Task] = []
         for name, task in self._tasks.items():
@@ -98,14 +105,15 @@ class ArmIk:
                 pose = goals[name]
                 task.set_target(mink.SE3(np.concatenate([pose[3:], pose[:3]])))
                 tasks.append(task)
-        if not tasks:
+        if not tasks or dt <= 0:
             return arms.copy()
+        moving = np.isin(self._owner, list(goals))
         q = qpos.copy()
-        q[self._qpos] = arms
+        q[self.qpos_address] = arms
         # A frozen joint measured beyond its limit would leave the program no solution.
         q[self._limited] = np.clip(q[self._limited], *self._range.T)
         rest = q.copy()
-        rest[self._qpos] = self._rest
+        rest[self.qpos_address] = self._rest
         self._posture.set_target(rest)
         self._configuration.update(q)
         step = min(dt, _MAX_DT) / self.iterations
@@ -118,13 +126,22 @@ class ArmIk:
                     solver="daqp",
                     damping=1e-4,
                     limits=self._limits,
-                    constraints=self._constraints,
+                    constraints=[self._freeze(moving)],
                 )
             except mink.NoSolutionFound:
                 self.failures += 1
                 break
             self._configuration.integrate_inplace(velocity, step)
-        return self._configuration.q[self._qpos]
+        return np.where(moving, self._configuration.q[self.qpos_address], arms)
+
+    def _freeze(self, moving: np.ndarray) -> mink.DofFreezingTask:
+        """Constraint that holds all but the arm joints that move. Shape (num_joints,), bool."""
+        owners = frozenset(self._owner[moving])
+        if owners not in self._freezing:
+            model = self._configuration.model
+            frozen = sorted(set(range(model.nv)) - set(self._dofs[moving].tolist()))
+            self._freezing[owners] = mink.DofFreezingTask(model, frozen)
+        return self._freezing[owners]
 
 
 def _find_pairs(model: mujoco.MjModel, morphology: Morphology) -> list[tuple[list[int], list[int]]]:

@@ -27,7 +27,8 @@ class StampedPlan(NamedTuple):
 class BackgroundPlanner:
     """Solves in a thread for the newest state and goal that were submitted.
 
-    A slow solve drops the states that came meanwhile: the next one starts from the newest.
+    A slow solve drops the states that came meanwhile: the next one starts from the newest. What
+    a solve raises is raised in the caller, by `submit` and `latest`, until the next `reset`.
 
     Args:
         retargeter: What solves; used by the thread alone from now on.
@@ -38,6 +39,7 @@ class BackgroundPlanner:
         self._ready = threading.Condition()
         self._job: tuple[RobotState, Goal, int] | None = None
         self._latest: StampedPlan | None = None
+        self._reset_to: RobotState | None = None
         self._epoch = 0
         self._running = True
         self._failure: Exception | None = None
@@ -45,8 +47,13 @@ class BackgroundPlanner:
         self._thread.start()
 
     def submit(self, state: RobotState, goal: Goal) -> None:
-        """Ask for a plan from `state` to `goal`; replaces what has not been begun."""
+        """Ask for a plan from `state` to `goal`; replaces what has not been begun.
+
+        Raises:
+            Exception: Whatever the last solve failed with.
+        """
         with self._ready:
+            self._check()
             self._job = (state, goal, self._epoch)
             self._ready.notify()
 
@@ -55,18 +62,17 @@ class BackgroundPlanner:
         """The newest plan since the last `reset`, None before the first.
 
         Raises:
-            Exception: Whatever ended the thread.
+            Exception: Whatever the last solve failed with.
         """
-        if self._failure is not None:
-            raise self._failure
         with self._ready:
+            self._check()
             return self._latest
 
     def reset(self, state: RobotState) -> None:
-        """Forget all plans, also the one being solved; start anew from `state`."""
+        """Forget all plans, also the one being solved, and failures; start anew from `state`."""
         with self._ready:
             self._epoch += 1
-            self._job = self._latest = None
+            self._job = self._latest = self._failure = None
             self._reset_to = state
 
     def close(self) -> None:
@@ -76,24 +82,32 @@ class BackgroundPlanner:
             self._ready.notify()
         self._thread.join()
 
+    def _check(self) -> None:
+        """Raise what the last solve failed with; the caller holds the lock."""
+        if self._failure is not None:
+            raise self._failure
+
     def _run(self) -> None:
         epoch = 0
-        try:
-            while True:
-                with self._ready:
-                    self._ready.wait_for(lambda: self._job is not None or not self._running)
-                    if not self._running:
-                        return
-                    assert self._job is not None
-                    state, goal, wanted = self._job
-                    self._job = None
-                if wanted != epoch:
-                    self._retargeter.reset(self._reset_to)
+        while True:
+            with self._ready:
+                self._ready.wait_for(lambda: self._job is not None or not self._running)
+                if not self._running:
+                    return
+                assert self._job is not None
+                state, goal, wanted = self._job
+                reset_to, self._job = self._reset_to, None
+            try:
+                if wanted != epoch and reset_to is not None:
+                    self._retargeter.reset(reset_to)
                     epoch = wanted
                 plan = self._retargeter.plan(state, goal)
+            except Exception as failure:
+                logger.exception("the planner has failed")
                 with self._ready:
                     if wanted == self._epoch:
-                        self._latest = StampedPlan(plan, state.time)
-        except Exception as failure:
-            self._failure = failure
-            logger.exception("the planner has ended")
+                        self._failure, self._job = failure, None
+                continue
+            with self._ready:
+                if wanted == self._epoch:
+                    self._latest = StampedPlan(plan, state.time)

@@ -24,7 +24,8 @@ class SiteKinematics:
     A rollout of 30 × 5 states needs 150 head poses; one NumPy pass over the bodies on the way
     to the sites gives them all, where a loop over `mj_kinematics` would cost as much as the
     physics. The local transforms of all joints are computed together,
-    :math:`R = R_0 (I + \sin q\,K + (1 - \cos q) K^2)`, and then chained body by body.
+    :math:`R = R_0 (I + \sin q\,K + (1 - \cos q) K^2)`, and then chained
+    body by body. Here q counts from the joint's reference angle, as in MuJoCo.
 
     Args:
         model: Model whose bodies carry at most one free, hinge or slide joint each.
@@ -51,7 +52,10 @@ class SiteKinematics:
             chains[name] = _find_chain(model, body)
         self._chains = chains
         self._masses = _find_masses(model, com_of) if com_of else {}
-        bodies = sorted({*(body for chain in chains.values() for body in chain), *self._masses})
+        ways = [*chains.values()]
+        if com_of:
+            ways.append(_find_chain(model, int(model.body(com_of).id)))
+        bodies = sorted({*(body for way in ways for body in way), *self._masses})
         self._bodies = bodies
         for body in bodies:
             _check_body(model, body)
@@ -70,13 +74,15 @@ class SiteKinematics:
         self._row = {body: row for row, body in enumerate(self._moving)}
         joints = [int(model.body_jntadr[body]) for body in self._moving]
         self._address = model.jnt_qposadr[joints]
+        self._reference = model.qpos0[self._address]
         self._slides = model.jnt_type[joints] == _SLIDE
         axes = model.jnt_axis[joints]
         self._axes = np.where(self._slides[:, None], axes, 0)
-        self._skew = np.stack([_make_skew(axis) for axis in axes])  # (J, 3, 3)
+        self._skew = np.array([_make_skew(axis) for axis in axes]).reshape(-1, 3, 3)
         self._skew[self._slides] = 0
         self._square = self._skew @ self._skew
-        self._fixed_moving = np.stack([self._fixed[body] for body in self._moving])  # (J, 4, 4)
+        fixed = [self._fixed[body] for body in self._moving]
+        self._fixed_moving = np.array(fixed).reshape(-1, 4, 4)  # (J, 4, 4)
 
     def compute_transforms(
         self, qpos: np.ndarray, sites: tuple[str, ...] = ()
@@ -104,14 +110,15 @@ class SiteKinematics:
     def _compute_world(self, flat: np.ndarray, needed: list[int]) -> dict[int, np.ndarray]:
         """World transform of each body of `needed`, which holds its ancestors. (n, 4, 4)."""
         local = self._compute_local(flat, [body for body in needed if body in self._row])
-        world: dict[int, np.ndarray] = {}
+        still = np.broadcast_to(np.eye(4), (len(flat), 4, 4))
+        world: dict[int, np.ndarray] = {0: still}  # sites may be on the world itself
         for body in needed:
             if body in self._free:
                 world[body] = _make_transforms(flat[:, self._free[body] :][:, :7])
                 continue
             own = local[body] if body in local else self._fixed[body]
             parent = self._parent[body]
-            world[body] = world[parent] @ own if parent else np.broadcast_to(own, (len(flat), 4, 4))
+            world[body] = world[parent] @ own if parent else still @ own
         return world
 
     def compute_positions(
@@ -134,7 +141,7 @@ class SiteKinematics:
         if not bodies:
             return {}
         rows = [self._row[body] for body in bodies]
-        angles = qpos[:, self._address[rows]].T  # (J, n)
+        angles = (qpos[:, self._address[rows]] - self._reference[rows]).T  # (J, n)
         joint = np.zeros((len(rows), len(qpos), 4, 4))
         sine, cosine = np.sin(angles)[..., None, None], np.cos(angles)[..., None, None]
         joint[..., :3, :3] = (
