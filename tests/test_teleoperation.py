@@ -6,6 +6,7 @@ import dataclasses
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.operator.alignment import EngageRefused
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
@@ -252,6 +254,47 @@ def test_each_engagement_plans_from_the_command_that_is_executed(rig, monkeypatc
     assert starts == expected
 
 
+def test_a_fall_ends_the_engagement_until_the_robot_stands_again(rig):
+    r = rig("rby1", mode="mobile")
+    r.run(0.2)
+    assert r.teleop.alignment.is_engaged
+    for _ in range(5):
+        state = dataclasses.replace(r.loop.state, fallen=True)
+        action, record = r.teleop.step(state)
+        assert not record.engaged
+        assert action.mode is Mode.STATIONARY
+        np.testing.assert_array_equal(action.arms, state.arms)
+        r.loop.execute(action, r.dt)
+    r.teleop.reset()
+    r.loop.reset(seed=0, settle_s=0.8)
+    assert r.tick()[1].engaged
+
+
+def test_an_operator_too_low_to_engage_is_an_error_before_the_robot_moves(rig):
+    r = rig("rby1")
+    r.person.motion = lambda t: make_frame(t, (0, 0, 0.3))
+    with pytest.raises(EngageRefused) as caught:
+        r.tick()
+    assert str(caught.value) == (
+        "cannot engage: the operator's head is 0.30 m over the device's floor, less than 0.5 m. "
+        "Set the device's floor, or --teleop.alignment.height_scale."
+    )
+    np.testing.assert_array_equal(r.loop.action.arms, r.loop.state.arms)
+
+
+def test_a_later_refusal_is_waited_out(rig, caplog):
+    """The person bends low while the head is lost: no reason to end the session."""
+    r = rig("rby1")
+    r.run(0.2)
+    r.person.motion = lambda t: None
+    r.run(0.2)
+    r.person.motion = lambda t: make_frame(t, (0, 0, 0.3))
+    assert not any(record.engaged for _, record in r.run(0.4))
+    assert [record.message[:13] for record in caplog.records] == ["cannot engage"]
+    r.person.motion = stand
+    assert r.tick()[1].engaged
+
+
 @robots
 def test_reset_starts_over(rig, name):
     r = rig(name)
@@ -315,7 +358,7 @@ def test_the_robot_follows_head_and_hands(rig, name):
         share = min(1.0, (t - start) / 1.0)
         frame = make_frame(t, (0, 0, 1.7 - 0.06 / scale * share))
         wrist = frame.left_wrist.copy()
-        wrist[:3] += share * np.array([0.05, 0.05, 0.1])
+        wrist[:3] += share * np.array([-0.02, 0.05, 0.1])
         wrist[3:] = quat_from_rpy(0.2 * share, 0, 0.2 * share)
         return dataclasses.replace(frame, left_wrist=wrist)
 
@@ -325,16 +368,10 @@ def test_the_robot_follows_head_and_hands(rig, name):
     now = r.frames
     assert goal.poses["head"][2] == pytest.approx(frames["head"][2] - 0.06, abs=1e-6)
     assert abs(now["head"][2] - goal.poses["head"][2]) < 0.03
-    # What the arms are asked for is right; G1's policy adds up to 0.2 rad to it.
-    asked = r.loop.state.true_qpos.copy()
-    joints = [joint for arm in r.morphology.arms for joint in arm.joints]
-    address = [int(r.loop.plant.model.joint(joint).qposadr[0]) for joint in joints]
-    asked[address] = ticks[-1][0].arms[: len(joints)]
-    poses = r.kinematics.compute_poses(asked)
+    # G1's policy adds up to 0.2 rad to what its arms are asked for; that is taken out again.
     for wrist in FRAMES[1:]:
-        wanted = goal.poses[wrist][:3]
-        assert np.linalg.norm(poses[r.morphology.frames[wrist]][:3] - wanted) < 0.06
-        assert np.linalg.norm(now[wrist][:3] - wanted) < (0.16 if name == "g1" else 0.02)
+        distance = np.linalg.norm(now[wrist][:3] - goal.poses[wrist][:3])
+        assert distance < (0.06 if name == "g1" else 0.02)
     assert_no_step(r, ticks)
 
 
@@ -347,6 +384,22 @@ def test_grippers_close_with_the_pinch(rig):
     np.testing.assert_allclose(record.goal.grips, [1, 0])
     r.person.motion = lambda t: make_frame(t, pinch=np.full(2, (0.015 + 0.06) / 2))
     np.testing.assert_allclose(r.tick()[0].arms[-2:], np.full(2, (closed + opened) / 2), atol=1e-7)
+
+
+def test_each_gripper_follows_the_hand_of_its_own_arm(rig):
+    """By the frame that the arm carries, in whatever order, and with fewer arms than hands."""
+    r = rig("rby1")
+    closed, opened = r.morphology.arms[0].gripper_range
+    goal = Goal({}, grips=np.array([1.0, 0.0]))
+    left, right = r.morphology.arms
+    for arms, expected in (
+        ((left, right), [closed, opened]),
+        ((right, left), [opened, closed]),
+        ((right,), [opened]),
+        ((dataclasses.replace(left, gripper=None), right), [opened]),
+    ):
+        r.teleop.morphology = SimpleNamespace(arms=arms)
+        np.testing.assert_array_equal(r.teleop._compute_grippers(goal), expected)
 
 
 def test_a_walking_goal_has_a_velocity(rig):
@@ -545,6 +598,17 @@ def test_a_failure_of_the_planner_reaches_the_caller(background):
     retargeter.go.release()
     with pytest.raises(RuntimeError, match="^no plan$"):
         wait_for(lambda: planner.latest is not None)
+    with pytest.raises(RuntimeError, match="^no plan$"):
+        planner.submit(make_state(2.0), Goal({}))
+    # A new engagement starts anew.
+    retargeter.failure = None
+    planner.reset(make_state(3.0))
+    assert planner.latest is None
+    planner.submit(make_state(3.0), Goal({}))
+    retargeter.go.release()
+    wait_for(lambda: planner.latest is not None)
+    assert planner.latest.time == 3.0
+    assert retargeter.resets == [3.0]
 
 
 def test_in_real_time_the_robot_holds_until_the_first_plan_and_then_follows():
@@ -582,8 +646,6 @@ def test_in_real_time_the_robot_holds_until_the_first_plan_and_then_follows():
     assert not any(thread.name == "xop-planner" for thread in threading.enumerate())
 
 
-@pytest.mark.xfail(strict=True, reason="the arms' kinematics divides by the time passed")
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_two_ticks_in_one_period_of_the_policy(rig):
     """On the wall clock the robot's time moves in steps of 20 ms, LeRobot's loop does not."""
     r = rig("rby1")
@@ -591,5 +653,6 @@ def test_two_ticks_in_one_period_of_the_policy(rig):
     state = r.loop.state
     r.teleop.step(state)
     second, _ = r.teleop.step(state)
+    np.testing.assert_array_equal(second.arms, state.arms)
     assert np.isfinite(second.command).all()
     assert np.isfinite(second.arms).all()

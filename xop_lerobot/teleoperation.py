@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -11,12 +12,13 @@ from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.operator.alignment import Alignment, AlignmentConfig, is_lost
+from xop_lerobot.operator.alignment import Alignment, AlignmentConfig, EngageRefused, is_lost
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import DoublePinchDetector, grip_from_pinch
 from xop_lerobot.operator.goal_velocity import GoalVelocity
 from xop_lerobot.plant.policy_loop import limit_action
+from xop_lerobot.retarget.arm_bias import ArmBias
 from xop_lerobot.retarget.arm_ik import ArmIk
 from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.config import RetargeterConfig
@@ -24,7 +26,9 @@ from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Plan
 from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
-from xop_lerobot.state import Goal, RobotState
+from xop_lerobot.state import FRAMES, Goal, RobotState
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -47,7 +51,8 @@ class Teleoperation:
 
     While nobody is engaged, the robot is asked to hold the posture it is in. A device that
     engages by itself does so as soon as the robot has settled; loss of the head's tracking ends
-    an engagement, and the next one aligns anew, so no command ever makes a step.
+    an engagement, and the next one aligns anew, so no command ever makes a step. A fall ends it
+    too, and nobody engages while the robot counts as fallen.
 
     Args:
         config: Its parts.
@@ -66,6 +71,8 @@ class Teleoperation:
         self._pinch = DoublePinchDetector()
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
         self._arm_ik = ArmIk(self.morphology)
+        self._arm_bias = ArmBias(self._arm_ik.joint_range)
+        self._was_engaged = False
         self._background = BackgroundPlanner(self.retargeter) if info.realtime else None
         self._start_over()
 
@@ -74,10 +81,15 @@ class Teleoperation:
         self._velocity.reset()
         self._pinch.reset()
         self._mode = self.device.start_mode
-        self._started = False
+        self._started = self._was_refused = False
+        self._forget_arms()
         self._plan: Plan | None = None
         self._plan_time = self._asked_time = -np.inf
         self._last_time: float | None = None
+
+    def _forget_arms(self) -> None:
+        """Start the arms anew from the targets that the robot executes."""
+        self._wanted_arms = self._sent_arms = np.zeros(0)
 
     def connect(self) -> None:
         """Open the device; a recording is read and checked here."""
@@ -102,6 +114,10 @@ class Teleoperation:
 
         Returns:
             The action, limited as the robot will limit it, and the record of the tick.
+
+        Raises:
+            EngageRefused: If a device that engages by itself cannot, the first time: the floor
+                of its recording is wrong, and no robot has moved yet. Later on the robot holds.
         """
         dt = self.dt if self._last_time is None else max(state.time - self._last_time, 0.0)
         self._last_time = state.time
@@ -115,6 +131,7 @@ class Teleoperation:
             wanted = self._drive(state, goal, poses["head"], dt)
         previous = RobotAction(state.command, state.mode, state.arms)
         action = limit_action(self.morphology, wanted, previous, self.dt)
+        self._sent_arms = action.arms[: self._arm_ik.num_joints]
         return action, self._make_record(state, frame, goal, wanted)
 
     def _compute_frames(self, state: RobotState) -> dict[str, np.ndarray]:
@@ -127,7 +144,7 @@ class Teleoperation:
     ) -> OperatorFrame | None:
         """Engage or disengage where it is time to; return the frame to use."""
         if self.alignment.is_engaged:
-            if frame is None or is_lost(frame):
+            if frame is None or is_lost(frame) or state.fallen:
                 self.disengage()
             return frame
         if not self.device.self_engaging or not state.settled or state.fallen:
@@ -137,14 +154,33 @@ class Teleoperation:
             self._started = True
             frame = self.device.read(state.time)
         if frame is not None and not is_lost(frame):
-            self.engage(state, frame, poses)
+            self._engage_itself(state, frame, poses)
         return frame
+
+    def _engage_itself(
+        self, state: RobotState, frame: OperatorFrame, poses: Mapping[str, np.ndarray]
+    ) -> None:
+        """Engage; a refusal is a fault of the set-up at first, and waited out later on."""
+        try:
+            self.engage(state, frame, poses)
+        except EngageRefused as refusal:
+            if not self._was_engaged:
+                raise
+            if not self._was_refused:
+                logger.warning("%s The robot holds.", refusal)
+            self._was_refused = True
 
     def engage(
         self, state: RobotState, frame: OperatorFrame, poses: Mapping[str, np.ndarray]
     ) -> None:
-        """Lay the operator on the robot and begin to drive it."""
+        """Lay the operator on the robot and begin to drive it.
+
+        Raises:
+            EngageRefused: If the head is not tracked, or is too low to be over the floor.
+        """
         self.alignment.engage(frame, poses, float(poses["head"][2]))
+        self._was_engaged, self._was_refused = True, False
+        self._forget_arms()
         self._velocity.reset()
         (self._background or self.retargeter).reset(state)
         self._plan = None
@@ -176,11 +212,28 @@ class Teleoperation:
         arms = state.arms.copy()
         wrists = compute_wrist_goals(goal.poses, head)
         num_joints = self._arm_ik.num_joints
-        arms[:num_joints] = self._arm_ik.solve(state.qpos, arms[:num_joints], wrists, dt)
+        arms[:num_joints] = self._drive_arms(state, wrists, dt)
         arms[num_joints:] = self._compute_grippers(goal)
         if self._plan is None:  # the background planner is still at its first one
             return RobotAction(self._hold(state).command, goal.mode, arms)
         return RobotAction(self._pick_command(self._plan, state.time), goal.mode, arms)
+
+    def _drive_arms(
+        self, state: RobotState, wrists: Mapping[str, np.ndarray], dt: float
+    ) -> np.ndarray:
+        """Arm targets [rad] that bring the wrists to their goals. Shape (num_joints,)."""
+        ik, bias = self._arm_ik, self._arm_bias
+        executed = state.arms[: ik.num_joints]
+        if not np.array_equal(executed, self._sent_arms):  # new, or somebody else drove the arms
+            self._wanted_arms = executed
+            bias.reset()
+        last, self._wanted_arms = (
+            self._wanted_arms,
+            ik.solve(state.qpos, self._wanted_arms, wrists, dt),
+        )
+        offset = state.qpos[ik.qpos_address] - executed
+        bias.update(offset, self._wanted_arms - last, dt)
+        return bias.compute_targets(self._wanted_arms)
 
     def _update_plan(self, state: RobotState, goal: Goal) -> None:
         """Plan where it is due; on the wall clock, ask for it and take the newest there is."""
@@ -204,11 +257,12 @@ class Teleoperation:
 
     def _compute_grippers(self, goal: Goal) -> np.ndarray:
         """Openings of the grippers [m], in the order of `arms`."""
+        grips: dict[str, float] = dict(zip(FRAMES[1:], goal.grips, strict=True))
         openings = []
-        for arm, grip in zip(self.morphology.arms, goal.grips, strict=True):
+        for arm in self.morphology.arms:
             if arm.gripper:
                 closed, opened = arm.gripper_range
-                openings.append(opened + grip * (closed - opened))
+                openings.append(opened + grips.get(arm.frame, 0.0) * (closed - opened))
         return np.array(openings)
 
     def _make_record(
