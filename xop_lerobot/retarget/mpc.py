@@ -37,6 +37,8 @@ from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
 from xop_lerobot.state import Goal, RobotState
 from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply, rotation_error
 
+_SLOW = 0.3  # speed up to which a base on wheels need not face where it goes [m/s]
+
 
 class MpcRetargeter(Retargeter):
     r"""Solves Eq. 1: :math:`\min_{a_0 \dots a_{H-1}} \sum_k l(x_k, a_k, G) + V_f(x_H, G)`.
@@ -248,11 +250,19 @@ class MpcRetargeter(Retargeter):
     def _compute_wanted_velocity(
         self, state: RobotState, then: Mapping[str, np.ndarray], config: MpcConfig
     ) -> np.ndarray:
-        """Velocity that takes the first tracked frame to its goal in time [m/s]. Shape (2,)."""
+        """Velocity that takes the first tracked frame to its goal in time, less a slow one.
+
+        At rest the base need not face the last centimetres: they are turned into, not driven.
+
+        Returns:
+            Velocity in the world [m/s]. Shape (2,).
+        """
         for name, poses in then.items():
             site = self.sites[name]
             here = self.kinematics.compute_positions(state.qpos, (site,))[site]
-            return (poses[0, :2] - here[:2]) / config.proposal_s
+            velocity = (poses[0, :2] - here[:2]) / config.proposal_s
+            speed = float(np.linalg.norm(velocity))
+            return velocity * max(0.0, 1 - _SLOW / max(speed, 1e-9))
         return np.zeros(2)
 
     def _noise_share(

@@ -16,6 +16,7 @@ from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.transforms import heading_error
 
+_DAMPING = 1e-3  # of the first step, in shares of a command's scale
 _STEP = 1e-4  # finite-difference step, in shares of a command's scale
 
 
@@ -53,8 +54,9 @@ class KinematicProposal:
     r"""Solves :math:`\min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \|\rho (a - a_0)/s\|^2`.
 
     φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` the neutral
-    command, s half the range of each entry and ρ its effort. A few damped Gauss-Newton steps
-    within the bounds; the Jacobian by finite differences, all columns in one batch.
+    command, s half the range of each entry and ρ its effort. A few
+    Levenberg-Marquardt steps within the bounds; the Jacobian by finite differences, all columns
+    in one batch.
 
     Args:
         command_model: What a command does.
@@ -62,7 +64,7 @@ class KinematicProposal:
         sites: Site of each tracked frame.
         weights: Weights of the errors.
         support: Area over which the centre of mass stays, None for a robot that balances itself.
-        iterations: Number of Gauss-Newton steps.
+        iterations: Number of linearisations.
     """
 
     def __init__(
@@ -72,7 +74,7 @@ class KinematicProposal:
         sites: Mapping[str, str],
         weights: ProposalWeights | None = None,
         support: SupportArea | None = None,
-        iterations: int = 4,
+        iterations: int = 6,
     ) -> None:
         self.command_model, self.kinematics, self.sites = command_model, kinematics, dict(sites)
         self.weights = weights or ProposalWeights()
@@ -127,20 +129,32 @@ class KinematicProposal:
             future = self.command_model.extrapolate(qpos, commands, dt, mode, drift, executed)
             return self._compute_residuals(future, goals, wanted_velocity)
 
+        best, least, damping = command, np.inf, _DAMPING
+        matrix = gradient = np.zeros(0)
         for _ in range(self.iterations):
             batch = np.tile(command, (len(index) + 1, 1))
             batch[np.arange(1, len(index) + 1), index] += _STEP * scale
             residuals = compute_residuals(batch)
-            jacobian = (residuals[1:] - residuals[0]).T / _STEP  # per share of scale
-            pull = np.square(effort) * (command[index] - space.neutral[index]) / scale
-            matrix = jacobian.T @ jacobian + np.diag(np.square(effort) + 1e-6)
-            gradient = jacobian.T @ residuals[0] + pull
+            share = (command[index] - space.neutral[index]) / scale
+            cost = np.square(residuals[0]).sum() + np.square(effort * share).sum()
+            if cost < least:  # a better point: linearise there, trust the step more
+                best, least, damping = command, cost, damping / 4
+                jacobian = (residuals[1:] - residuals[0]).T / _STEP  # per share of scale
+                matrix = jacobian.T @ jacobian + np.diag(np.square(effort))
+                gradient = jacobian.T @ residuals[0] + np.square(effort) * share
+            elif not np.isfinite(least):
+                return command  # not a number: nothing to improve on
+            else:
+                damping *= 16
             step = _solve_in_box(
-                matrix, gradient, (low - command[index]) / scale, (high - command[index]) / scale
+                matrix + damping * np.eye(len(index)),
+                gradient,
+                (low - best[index]) / scale,
+                (high - best[index]) / scale,
             )
-            command = command.copy()
-            command[index] = np.clip(command[index] + scale * step, low, high)
-        return command
+            command = best.copy()
+            command[index] = np.clip(best[index] + scale * step, low, high)
+        return best
 
     def _compute_residuals(
         self,
