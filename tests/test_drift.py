@@ -135,10 +135,6 @@ def test_driving_straight_with_wheels_is_no_drift():
     np.testing.assert_allclose(observer.drift, 0, atol=0.02)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the base frame swings about a pivot ahead of it; the observer takes that for a drift",
-)
 def test_turning_about_a_pivot_ahead_of_the_base_is_no_drift():
     model = make_model("rby1")
     assert model.pivot > 0.2

@@ -227,7 +227,6 @@ def test_equal_costs_weigh_the_same(weighting):
     np.testing.assert_array_equal(weights, [0.5, 0, 0.5])
 
 
-@pytest.mark.xfail(strict=True, reason="0 * NaN is NaN: one bad candidate spoils the whole plan")
 def test_a_candidate_that_is_not_finite_does_not_spoil_the_plan():
     kmppi = make_kmppi()
     kmppi.reset(COMMAND)

@@ -31,7 +31,7 @@ from xop_lerobot.low_level.falcon_observation import (
     compute_projected_gravity,
     compute_targets,
 )
-from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput, make_policy
+from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput, make_policy
 from xop_lerobot.low_level.student import WEIGHTS_FILE, Student, load_weights, save_weights
 from xop_lerobot.low_level.trial import run_trials
 from xop_lerobot.morphology.morphology import make_morphology
@@ -83,9 +83,7 @@ def test_unknown_policy_is_named_with_the_known_ones() -> None:
     """A wrong name lists what there is."""
     with pytest.raises(UnknownName) as error:
         make_policy("falkon")
-    assert str(error.value) == (
-        "unknown low-level policy 'falkon'. Known: default, diff_drive, falcon"
-    )
+    assert str(error.value) == (f"unknown low-level policy 'falkon'. Known: {', '.join(POLICIES)}")
 
 
 def test_every_default_of_a_robot_is_registered() -> None:

@@ -205,9 +205,6 @@ def test_a_time_step_that_does_not_divide_the_policys_period_is_refused(parts):
     )
 
 
-@pytest.mark.xfail(
-    strict=True, reason="MuJoCo puts a diverged sample back to the model's start, at the origin"
-)
 def test_a_sample_that_diverges_is_not_finite(parts):
     p = parts["rby1"]
     state = p.loop.state

@@ -22,6 +22,7 @@ from xop_lerobot.retarget.arm_bias import ArmBias
 from xop_lerobot.retarget.arm_ik import ArmIk
 from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Plan
@@ -65,7 +66,13 @@ class Teleoperation:
         self.device = make_device(config.device)
         model = build_model(self.morphology, "planning", scene=info.scene)
         policy = make_policy(info.low_level, info.low_level_path)
-        self.retargeter = make_retargeter(config.retargeter, self.morphology, policy, model)
+        obstacles: tuple[Obstacle, ...] | None = None
+        if self.morphology.hull_points:  # the planning model holds the floor alone
+            scene = build_model(self.morphology, "full", scene=info.scene)
+            obstacles = make_obstacles(scene)
+        self.retargeter = make_retargeter(
+            config.retargeter, self.morphology, policy, model, obstacles
+        )
         self.alignment = Alignment(config.alignment)
         self._velocity = GoalVelocity()
         self._pinch = DoublePinchDetector()

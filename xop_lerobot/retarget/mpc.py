@@ -27,7 +27,7 @@ from xop_lerobot.retarget.costs import (
     TerminalCost,
     TrackingCost,
 )
-from xop_lerobot.retarget.costs.collision import make_obstacles
+from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
 from xop_lerobot.retarget.drift import DriftObserver
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.kmppi import Kmppi, Samples, compute_effective_samples
@@ -54,6 +54,7 @@ class MpcRetargeter(Retargeter):
         model: Its planning model in the scene.
         config: Settings; zeros take the robot's own parameters.
         frames: Tracked frames that the commands shall follow.
+        obstacles: What to keep clear of; by default what is fixed in `model`.
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class MpcRetargeter(Retargeter):
         model: mujoco.MjModel,
         config: RetargeterConfig | None = None,
         frames: tuple[str, ...] = ("head",),
+        obstacles: tuple[Obstacle, ...] | None = None,
     ) -> None:
         config = config or RetargeterConfig()
         self.morphology, self.frames = morphology, frames
@@ -71,8 +73,9 @@ class MpcRetargeter(Retargeter):
         self.rollout = PolicyRollout(model, policy, config.num_threads)
         self.command_model = CommandModel(model, self.space, morphology.effects, morphology.pivot)
         self.sites = {name: morphology.frames[name] for name in frames}
-        obstacles = make_obstacles(model)
+        obstacles = make_obstacles(model) if obstacles is None else obstacles
         hull = morphology.hull_points if obstacles else {}
+        self._hull = tuple(hull)
         self._points = tuple(dict.fromkeys((*morphology.contact_points, *hull)))
         self.kinematics = SiteKinematics(
             model,
@@ -311,6 +314,9 @@ class MpcRetargeter(Retargeter):
             reference=reference,
             poses={name: poses[site] for name, site in sites.items()},
             points=self.kinematics.compute_positions(prediction.qpos, self._points),
+            terminal_points=(
+                self.kinematics.compute_positions(extrapolated, self._hull) if self._hull else {}
+            ),
             com=com,
             terminal_qpos=extrapolated,
             terminal_com=terminal_com,

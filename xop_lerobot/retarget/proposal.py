@@ -125,6 +125,7 @@ class KinematicProposal:
         low, high = low[index], high[index]
         command[index] = np.clip(command[index], low, high)
         scale, effort = self.scale[index], self._effort[index]
+
         def compute_residuals(commands: np.ndarray) -> np.ndarray:
             future = self.command_model.extrapolate(qpos, commands, dt, mode, drift, executed)
             return self._compute_residuals(future, goals, wanted_velocity)

@@ -27,13 +27,13 @@ CONFIGS = {
         weights=CostWeights(orientation=0.2),
     ),
     Mode.MOBILE: MpcConfig(
-        num_samples=12,
+        num_samples=16,
         horizon=16,
         noise_std={
             "waist_roll": 0.03, "waist_pitch": 0.05, "vx": 0.25, "vy": 0.2, "yaw_rate": 0.3,
         },
         # A walking robot that leans as its operator does pays with its balance.
-        weights=CostWeights(orientation=0.05, tilt_share=0.2),
+        weights=CostWeights(orientation=0.03, tilt_share=0.3),
     ),
 }  # fmt: skip
 

@@ -10,7 +10,7 @@ import numpy as np
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
 from xop_lerobot.morphology.rby1.links import LINKS
-from xop_lerobot.morphology.rby1.mpc import EFFECTS, PIVOT, SUPPORT, mpc_config
+from xop_lerobot.morphology.rby1.mpc import EFFECTS, HULL, PIVOT, SUPPORT, mpc_config
 
 if TYPE_CHECKING:
     import mujoco
@@ -79,6 +79,7 @@ class RBY1(Morphology):
     effects = EFFECTS
     pivot = PIVOT
     support = SUPPORT
+    hull_points = HULL
     fall_height = -0.2
     fall_tilt = 0.35
     wheeled = True

@@ -12,6 +12,17 @@ PIVOT = 0.228
 SUPPORT = ((0.228, -0.265), (0.228, 0.265), (-0.275, 0.085), (-0.275, -0.085))
 """Where the wheels and the casters touch the ground, in the base frame [m]."""
 
+HULL = {
+    "hull_front_left": 0.17,
+    "hull_front_right": 0.17,
+    "hull_rear_left": 0.17,
+    "hull_rear_right": 0.17,
+    "head": 0.15,
+    "left_palm": 0.1,
+    "right_palm": 0.1,
+}
+"""Circles about these sites cover the base (to 5 cm beyond its corners), head and hands [m]."""
+
 EFFECTS = (
     Effect(Acts.FORWARD),
     Effect(Acts.TURN),

@@ -118,6 +118,10 @@ SITES = (
     Frame("right_wrist", "ee_right", (0, 0, 0), (0, 0, -1), (0, -1, 0)),
     Frame("left_palm", "ee_left", (0, 0, -0.12), (0, 0, -1), (0, 1, 0)),
     Frame("right_palm", "ee_right", (0, 0, -0.12), (0, 0, -1), (0, -1, 0)),
+    Frame("hull_front_left", "base", (0.19, 0.145, 0.2)),
+    Frame("hull_front_right", "base", (0.19, -0.145, 0.2)),
+    Frame("hull_rear_left", "base", (-0.22, 0.145, 0.2)),
+    Frame("hull_rear_right", "base", (-0.22, -0.145, 0.2)),
     Frame("left_wheel_center", "wheel_l", (0, 0, 0)),
     Frame("right_wheel_center", "wheel_r", (0, 0, 0)),
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.transforms import quat_conjugate, quat_rotate
 
@@ -61,6 +63,9 @@ def make_obstacles(model: mujoco.MjModel) -> tuple[Obstacle, ...]:
 class CollisionCost(Cost):
     r"""Mean of :math:`\sum_j w_c e^{-\alpha d_j} + w_v\|v\|^2 e^{-\beta d_j}` over steps.
 
+    The same barrier counts once more at the end of the extrapolation: the horizon alone is too
+    short to brake before a wall.
+
     :math:`d_j` is the least distance of the robot's body points to obstacle j, v the velocity
     of the base. Obstacles beyond one metre cost nothing: the term is cut off there smoothly, so
     that far walls do not push.
@@ -87,11 +92,23 @@ class CollisionCost(Cost):
         """Cost of every sample. Shape (K,)."""
         if not self.obstacles or not self.points:
             return np.zeros(len(evaluation.qpos))
-        hull = np.stack([evaluation.points[site][:, 1:] for site in self.points], axis=-2)
-        radii = np.array(list(self.points.values()))
         speed = np.square(evaluation.qvel[:, 1:, :2]).sum(-1)
-        weights = evaluation.weights
-        total = np.zeros(hull.shape[:2])
+        moving = self._compute_barrier(evaluation.points, speed, evaluation.weights)
+        resting = self._compute_barrier(
+            evaluation.terminal_points, speed[:, -1], evaluation.weights
+        )
+        return moving.mean(axis=1) + resting
+
+    def _compute_barrier(
+        self, points: Mapping[str, np.ndarray], speed: np.ndarray, weights: CostWeights
+    ) -> np.ndarray:
+        """Barriers of all obstacles, at the steps that `speed` is for. Shape of `speed`."""
+        radii = np.array(list(self.points.values()))
+        positions = [points[site] for site in self.points]
+        if speed.ndim > 1:  # the first step is the start, which no command changes
+            positions = [position[:, 1:] for position in positions]
+        hull = np.stack(positions, axis=-2)
+        total = np.zeros(speed.shape)
         for obstacle in self.obstacles:
             distance = (obstacle.compute_distance(hull) - radii).min(axis=-1)
             for weight, decay in (
@@ -100,4 +117,4 @@ class CollisionCost(Cost):
             ):
                 barrier = np.exp(-decay * distance) - np.exp(-decay * _RANGE)
                 total += weight * np.maximum(barrier, 0)
-        return total.mean(axis=1)
+        return total

@@ -23,6 +23,7 @@ class Evaluation:
         reference: The command that costs nothing. Shape (k,).
         poses: Predicted pose of each tracked frame. Shapes (K, H + 1, 7).
         points: Predicted position of contact and hull sites. Shapes (K, H + 1, 3).
+        terminal_points: Position of those sites at the end of the extrapolation. Shape (K, 3).
         com: Predicted centre of mass, of robots with a support area. Shape (K, H + 1, 3).
         terminal_qpos: Position at the end of the extrapolation. Shape (K, nq).
         terminal_com: Centre of mass then, of robots with a support area. Shape (K, 3).
@@ -41,6 +42,7 @@ class Evaluation:
     reference: np.ndarray
     poses: Mapping[str, np.ndarray]
     points: Mapping[str, np.ndarray]
+    terminal_points: Mapping[str, np.ndarray]
     com: np.ndarray
     terminal_qpos: np.ndarray
     terminal_com: np.ndarray
