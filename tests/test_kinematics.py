@@ -95,7 +95,7 @@ def assert_equal_to_mujoco(
             np.testing.assert_allclose(got[:3], expected[name][:3], atol=1e-12)
             # A half turn has two quaternions with w near 0.
             assert abs(got[3:] @ expected[name][3:]) == pytest.approx(1, abs=1e-12)
-            np.testing.assert_array_equal(positions[name][index], got[:3])
+            np.testing.assert_allclose(positions[name][index], got[:3], atol=1e-12)
         if com is not None:
             np.testing.assert_allclose(com[index], expected_com, atol=1e-12)
 

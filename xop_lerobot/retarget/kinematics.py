@@ -41,21 +41,21 @@ class SiteKinematics:
         self, model: mujoco.MjModel, sites: tuple[str, ...], com_of: str | None = None
     ) -> None:
         known = [model.site(i).name for i in range(model.nsite)]
-        self._sites: dict[str, tuple[int, np.ndarray]] = {}
+        self.site_frames: dict[str, tuple[int, np.ndarray]] = {}
         chains: dict[str, list[int]] = {}
         for name in sites:
             if name not in known:
                 raise UnknownName("site", name, known)
             site = model.site(name)
             body = int(site.bodyid[0])
-            self._sites[name] = (body, _make_transform(site.pos, site.quat))
+            self.site_frames[name] = (body, _make_transform(site.pos, site.quat))
             chains[name] = _find_chain(model, body)
         self._chains = chains
-        self._masses = _find_masses(model, com_of) if com_of else {}
+        self.masses = _find_masses(model, com_of) if com_of else {}
         ways = [*chains.values()]
         if com_of:
             ways.append(_find_chain(model, int(model.body(com_of).id)))
-        bodies = sorted({*(body for way in ways for body in way), *self._masses})
+        bodies = sorted({*(body for way in ways for body in way), *self.masses})
         self._bodies = bodies
         for body in bodies:
             _check_body(model, body)
@@ -84,28 +84,34 @@ class SiteKinematics:
         fixed = [self._fixed[body] for body in self._moving]
         self._fixed_moving = np.array(fixed).reshape(-1, 4, 4)  # (J, 4, 4)
 
-    def compute_transforms(
-        self, qpos: np.ndarray, sites: tuple[str, ...] = ()
-    ) -> dict[str, np.ndarray]:
-        """Homogeneous transforms of `sites` (all by default). (..., nq) -> (..., 4, 4)."""
-        sites = sites or tuple(self._sites)
-        shape = qpos.shape[:-1]
-        needed = sorted({body for site in sites for body in self._chains[site]})
-        world = self._compute_world(qpos.reshape(-1, qpos.shape[-1]), needed)
-        return {
-            site: (world[self._sites[site][0]] @ self._sites[site][1]).reshape(*shape, 4, 4)
-            for site in sites
-        }
+    def compute_bodies(
+        self, qpos: np.ndarray, sites: tuple[str, ...] = (), *, com: bool = False
+    ) -> Bodies:
+        """Place the bodies once, to ask for several things.
+
+        Args:
+            qpos: Configurations. Shape (..., nq).
+            sites: Sites that will be asked for; all by default.
+            com: Whether the centre of mass will be asked for.
+        """
+        needed = {body for site in sites or self.site_frames for body in self._chains[site]}
+        bodies = self._bodies if com else sorted(needed)
+        world = self._compute_world(qpos.reshape(-1, qpos.shape[-1]), bodies)
+        return Bodies(self, qpos.shape[:-1], world)
 
     def compute_com(self, qpos: np.ndarray) -> np.ndarray:
         """Centre of mass of the subtree `com_of` in the world [m]. (..., nq) -> (..., 3)."""
-        world = self._compute_world(qpos.reshape(-1, qpos.shape[-1]), self._bodies)
-        total = sum(mass for mass, _ in self._masses.values())
-        com = sum(
-            mass / total * (world[body][:, :3, :3] @ centre + world[body][:, :3, 3])
-            for body, (mass, centre) in self._masses.items()
-        )
-        return np.asarray(com).reshape(*qpos.shape[:-1], 3)
+        return self.compute_bodies(qpos, com=True).compute_com()
+
+    def compute_positions(
+        self, qpos: np.ndarray, sites: tuple[str, ...] = ()
+    ) -> dict[str, np.ndarray]:
+        """World positions of `sites` [m]. Shape (..., nq) -> (..., 3) each."""
+        return self.compute_bodies(qpos, sites).compute_positions(sites or tuple(self.site_frames))
+
+    def compute_poses(self, qpos: np.ndarray, sites: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+        """World poses x y z qw qx qy qz of `sites`. Shape (..., nq) -> (..., 7) each."""
+        return self.compute_bodies(qpos, sites).compute_poses(sites or tuple(self.site_frames))
 
     def _compute_world(self, flat: np.ndarray, needed: list[int]) -> dict[int, np.ndarray]:
         """World transform of each body of `needed`, which holds its ancestors. (n, 4, 4)."""
@@ -120,21 +126,6 @@ class SiteKinematics:
             parent = self._parent[body]
             world[body] = world[parent] @ own if parent else still @ own
         return world
-
-    def compute_positions(
-        self, qpos: np.ndarray, sites: tuple[str, ...] = ()
-    ) -> dict[str, np.ndarray]:
-        """World positions of `sites` [m]. Shape (..., nq) -> (..., 3) each."""
-        transforms = self.compute_transforms(qpos, sites)
-        return {site: transform[..., :3, 3] for site, transform in transforms.items()}
-
-    def compute_poses(self, qpos: np.ndarray, sites: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
-        """World poses x y z qw qx qy qz of `sites`. Shape (..., nq) -> (..., 7) each."""
-        transforms = self.compute_transforms(qpos, sites)
-        return {
-            site: make_pose(transform[..., :3, 3], quat_from_matrix(transform[..., :3, :3]))
-            for site, transform in transforms.items()
-        }
 
     def _compute_local(self, qpos: np.ndarray, bodies: list[int]) -> dict[int, np.ndarray]:
         """Transform of each body to its parent, all joints at once. Shapes (n, 4, 4)."""
@@ -151,6 +142,50 @@ class SiteKinematics:
         joint[..., 3, 3] = 1
         local = self._fixed_moving[rows, None] @ joint
         return dict(zip(bodies, local, strict=True))
+
+
+class Bodies:
+    """The bodies of a batch of configurations, placed in the world.
+
+    Args:
+        kinematics: What placed them.
+        shape: Leading dimensions of the batch.
+        world: Transform of each body. Shapes (n, 4, 4).
+    """
+
+    def __init__(
+        self, kinematics: SiteKinematics, shape: tuple[int, ...], world: dict[int, np.ndarray]
+    ) -> None:
+        self._kinematics, self._shape, self._world = kinematics, shape, world
+
+    def _compute_transform(self, site: str) -> np.ndarray:
+        body, own = self._kinematics.site_frames[site]
+        return (self._world[body] @ own).reshape(*self._shape, 4, 4)
+
+    def compute_positions(self, sites: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """World positions of `sites` [m]. Shapes (..., 3)."""
+        positions = {}
+        for site in sites:
+            body, own = self._kinematics.site_frames[site]
+            positions[site] = (self._world[body] @ own[:, 3])[:, :3].reshape(*self._shape, 3)
+        return positions
+
+    def compute_poses(self, sites: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """World poses x y z qw qx qy qz of `sites`. Shapes (..., 7)."""
+        transforms = {site: self._compute_transform(site) for site in sites}
+        return {
+            site: make_pose(transform[..., :3, 3], quat_from_matrix(transform[..., :3, :3]))
+            for site, transform in transforms.items()
+        }
+
+    def compute_com(self) -> np.ndarray:
+        """Centre of mass of the subtree `com_of` in the world [m]. Shape (..., 3)."""
+        masses = self._kinematics.masses
+        total = sum(mass for mass, _ in masses.values())
+        moments = np.array([[*(mass * centre), mass] for mass, centre in masses.values()]) / total
+        stacked = np.stack([self._world[body] for body in masses])  # (bodies, n, 4, 4)
+        com = np.einsum("bnij,bj->ni", stacked[..., :3, :], moments)
+        return com.reshape(*self._shape, 3)
 
 
 def _find_chain(model: mujoco.MjModel, body: int) -> list[int]:

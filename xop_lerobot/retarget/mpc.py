@@ -300,12 +300,12 @@ class MpcRetargeter(Retargeter):
             self.drift.drift,
             executed=prediction.commands[:, -1],
         )
-        terminal = self.kinematics.compute_poses(extrapolated, tuple(sites.values()))
-        poses = self.kinematics.compute_poses(prediction.qpos, tuple(sites.values()))
-        com = terminal_com = np.zeros(0)
-        if self.support is not None:
-            com = self.kinematics.compute_com(prediction.qpos)
-            terminal_com = self.kinematics.compute_com(extrapolated)
+        names, supported = tuple(sites.values()), self.support is not None
+        then = self.kinematics.compute_bodies(extrapolated, (*names, *self._hull), com=supported)
+        ahead = self.kinematics.compute_bodies(
+            prediction.qpos, (*names, *self._points), com=supported
+        )
+        terminal, poses = then.compute_poses(names), ahead.compute_poses(names)
         last = config.horizon * POLICY_DT + config.extrapolation_s
         evaluation = Evaluation(
             qpos=prediction.qpos,
@@ -313,13 +313,11 @@ class MpcRetargeter(Retargeter):
             commands=samples.commands,
             reference=reference,
             poses={name: poses[site] for name, site in sites.items()},
-            points=self.kinematics.compute_positions(prediction.qpos, self._points),
-            terminal_points=(
-                self.kinematics.compute_positions(extrapolated, self._hull) if self._hull else {}
-            ),
-            com=com,
+            points=ahead.compute_positions(self._points),
+            terminal_points=then.compute_positions(self._hull),
+            com=ahead.compute_com() if supported else np.zeros(0),
             terminal_qpos=extrapolated,
-            terminal_com=terminal_com,
+            terminal_com=then.compute_com() if supported else np.zeros(0),
             goals=goals,
             terminal_poses={name: terminal[site] for name, site in sites.items()},
             terminal_goals={

@@ -164,14 +164,16 @@ class KinematicProposal:
         wanted_velocity: np.ndarray | None,
     ) -> np.ndarray:
         """Weighted errors of a batch of extrapolated configurations. Shape (n, residuals)."""
-        poses = self.kinematics.compute_poses(future, tuple(self.sites[name] for name in goals))
+        sites = tuple(self.sites[name] for name in goals)
+        bodies = self.kinematics.compute_bodies(future, sites, com=self.support is not None)
+        poses = bodies.compute_poses(sites)
         parts = []
         for name, goal in goals.items():
             pose = poses[self.sites[name]]
             parts.append((pose[:, :3] - goal[:3]) * self.weights.position)
             parts.append(-heading_error(goal[3:], pose[:, 3:]) * self.weights.orientation)
         if self.support is not None:
-            com = self.kinematics.compute_com(future)[:, :2]
+            com = bodies.compute_com()[:, :2]
             base = future[:, :7]
             parts.append(self.weights.support * self.support.compute_excess(base, com))
             parts.append(self.weights.lean * self.support.compute_lean(base, com))

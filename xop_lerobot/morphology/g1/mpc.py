@@ -27,8 +27,8 @@ CONFIGS = {
         weights=CostWeights(orientation=0.2),
     ),
     Mode.MOBILE: MpcConfig(
-        num_samples=16,
-        horizon=16,
+        num_samples=12,
+        horizon=14,
         noise_std={
             "waist_roll": 0.03, "waist_pitch": 0.05, "vx": 0.25, "vy": 0.2, "yaw_rate": 0.3,
         },
