@@ -32,7 +32,7 @@ class DeviceConfig:
     mode: str | None = None
     episode: int = 0
     speed: float = 1.0
-    hold_s: float = 5.0
+    hold_s: float = 6.0
     seed: int = 0
     noise: float = 1.0
 
