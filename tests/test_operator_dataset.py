@@ -64,7 +64,7 @@ def write_dataset(root: Path, without: str | None = None, engages: bool = True) 
 
 def test_episode_replays_from_the_moment_of_engaging(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "set")
-    device = make_device(DeviceConfig(type="replay", path=str(root), episode=1))
+    device = make_device(DeviceConfig(type="replay", path=str(root), episode=1, hold_s=5.0))
     device.connect()
     device.start(0.0)
     for i in range(LENGTH - ENGAGED_AT):

@@ -84,8 +84,9 @@ class MpcRetargeter(Retargeter):
         )
         self.support = None
         if morphology.support:
-            resting = self.kinematics.compute_com(morphology.standing_qpos())
-            self.support = SupportArea(morphology.support, tuple(resting[:2]))
+            first = self.sites[frames[0]]
+            resting = self.kinematics.compute_positions(morphology.standing_qpos(), (first,))
+            self.support = SupportArea(morphology.support, tuple(resting[first][:2]))
         self.proposals = {
             mode: KinematicProposal(
                 self.command_model,
@@ -93,6 +94,7 @@ class MpcRetargeter(Retargeter):
                 self.sites,
                 make_proposal_weights(each.weights),
                 self.support,
+                iterations=4,
             )
             for mode, each in self.configs.items()
         }
@@ -124,6 +126,7 @@ class MpcRetargeter(Retargeter):
         }
         self.drift = DriftObserver(self.command_model)
         self._last: tuple[float, Mode] | None = None
+        self._proposal = self.space.neutral
 
     def control_period(self, mode: Mode) -> float:
         """Time between two plans in `mode` [s]."""
@@ -137,6 +140,7 @@ class MpcRetargeter(Retargeter):
         """Start anew from the command that `state` executes, with the seed's first samples."""
         self._rng = np.random.default_rng(self._seed)
         self._last = None
+        self._proposal = state.command
         self.drift.reset()
         for planner in self._planners.values():
             planner.reset(state.command)
@@ -157,13 +161,14 @@ class MpcRetargeter(Retargeter):
             {name: poses[0] for name, poses in then.items()},
             mode,
             config.proposal_s,
-            start=planner.commands[0],
+            start=self._proposal,
             drift=self.drift.drift,
             executed=state.command,
             wanted_velocity=wanted,
         )
         if not np.isfinite(proposal).all():
             proposal = state.command
+        self._proposal = proposal  # the next solve starts here: a few steps a tick are enough
         candidates = np.stack([proposal, state.command, self.space.neutral])
         acting = self.command_model.acting(mode)
         candidates = np.where(acting, candidates, self.space.neutral)
