@@ -26,8 +26,7 @@ class CostWeights:
             scale [1].
         terminal: w_f, factor on the tracking cost at the end of the horizon [1].
         support: Squared distance of the zero-moment point out of the safe support area [1/m²].
-        lean: Squared distance of the first tracked frame from where it rests over the base,
-            beyond a free circle [1/m²].
+        lean: Squared distance of the centre of mass from where it rests on the base [1/m²].
         lateral: Squared part of the wanted velocity across the heading of a base on wheels
             [s²/m²].
         fall: Squared tilt of the base over the safe one, and height under it [1].

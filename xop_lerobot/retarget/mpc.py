@@ -84,9 +84,8 @@ class MpcRetargeter(Retargeter):
         )
         self.support = None
         if morphology.support:
-            first = self.sites[frames[0]]
-            resting = self.kinematics.compute_positions(morphology.standing_qpos(), (first,))
-            self.support = SupportArea(morphology.support, tuple(resting[first][:2]))
+            resting = self.kinematics.compute_com(morphology.standing_qpos())
+            self.support = SupportArea(morphology.support, tuple(resting[:2]))
         self.proposals = {
             mode: KinematicProposal(
                 self.command_model,
@@ -94,7 +93,6 @@ class MpcRetargeter(Retargeter):
                 self.sites,
                 make_proposal_weights(each.weights),
                 self.support,
-                iterations=4,
             )
             for mode, each in self.configs.items()
         }
@@ -126,7 +124,6 @@ class MpcRetargeter(Retargeter):
         }
         self.drift = DriftObserver(self.command_model)
         self._last: tuple[float, Mode] | None = None
-        self._proposal = self.space.neutral
 
     def control_period(self, mode: Mode) -> float:
         """Time between two plans in `mode` [s]."""
@@ -140,7 +137,6 @@ class MpcRetargeter(Retargeter):
         """Start anew from the command that `state` executes, with the seed's first samples."""
         self._rng = np.random.default_rng(self._seed)
         self._last = None
-        self._proposal = state.command
         self.drift.reset()
         for planner in self._planners.values():
             planner.reset(state.command)
@@ -161,14 +157,13 @@ class MpcRetargeter(Retargeter):
             {name: poses[0] for name, poses in then.items()},
             mode,
             config.proposal_s,
-            start=self._proposal,
+            start=planner.commands[0],
             drift=self.drift.drift,
             executed=state.command,
             wanted_velocity=wanted,
         )
         if not np.isfinite(proposal).all():
             proposal = state.command
-        self._proposal = proposal  # the next solve starts here: a few steps a tick are enough
         candidates = np.stack([proposal, state.command, self.space.neutral])
         acting = self.command_model.acting(mode)
         candidates = np.where(acting, candidates, self.space.neutral)

@@ -29,7 +29,7 @@ class ProposalWeights:
         orientation: Of roll, pitch and heading, as in `heading_error` [1/rad].
         effort: Of the command's distance from neutral, over its scale [1].
         support: Of the centre of mass beyond the support area [1/m].
-        lean: Of the first tracked frame far from where it rests over the base [1/m].
+        lean: Of the centre of mass from where it rests on the base [1/m].
         lateral: Of the wanted velocity across the heading of a base on wheels [s/m].
     """
 
@@ -176,9 +176,7 @@ class KinematicProposal:
             com = bodies.compute_com()[:, :2]
             base = future[:, :7]
             parts.append(self.weights.support * self.support.compute_excess(base, com))
-            for site in sites[:1]:
-                lean = self.support.compute_lean(base, poses[site][:, :2])
-                parts.append(self.weights.lean * lean)
+            parts.append(self.weights.lean * self.support.compute_lean(base, com))
         if self.command_model.is_nonholonomic and wanted_velocity is not None:
             lateral = compute_lateral(future[:, :7], wanted_velocity)
             parts.append(self.weights.lateral * lateral[:, None])

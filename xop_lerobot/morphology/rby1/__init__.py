@@ -52,7 +52,7 @@ class RBY1(Morphology):
     name = "rby1"
     command_space = CommandSpace(
         (
-            CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.2, mobile_only=True),
+            CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.5, mobile_only=True),
             CommandDim("yaw_rate", "theta.vel", "rad/s", -1.5, 1.5, 0.0, 3.0, mobile_only=True),
             *_make_torso_dims(),
         )

@@ -15,9 +15,9 @@ class SupportArea:
 
     Args:
         corners: Corners (x, y) in the base's frame, counterclockwise [m]. Shape (c, 2).
-        resting: Where the first tracked frame is at rest, in the base's frame [m]. Shape (2,).
+        resting: Where the centre of mass is at rest, in the base's frame [m]. Shape (2,).
         margin: Distance that is kept from every edge [m].
-        free: Distance from rest up to which a lean costs nothing: chests bend [m].
+        free: Distance from rest up to which a lean costs nothing: arms reach, chests bend [m].
     """
 
     def __init__(
@@ -25,7 +25,7 @@ class SupportArea:
         corners: tuple[tuple[float, float], ...],
         resting: tuple[float, float] = (0.0, 0.0),
         margin: float = 0.1,
-        free: float = 0.2,
+        free: float = 0.05,
     ) -> None:
         points = np.array(corners, dtype=float)
         edges = np.roll(points, -1, axis=0) - points
@@ -39,12 +39,12 @@ class SupportArea:
         """Distances of points beyond each edge, 0 inside [m]. (..., 7), (..., 2) -> (..., c)."""
         return np.maximum(_to_base(base, points) @ self._normals.T - self._offsets, 0)
 
-    def compute_lean(self, base: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Place of the tracked frame beyond the free circle about where it rests [m].
+    def compute_lean(self, base: np.ndarray, com: np.ndarray) -> np.ndarray:
+        """Place of the centre of mass beyond the free circle about where it rests [m].
 
         Shapes (..., 7), (..., 2) -> (..., 2).
         """
-        offset = _to_base(base, points) - self._resting
+        offset = _to_base(base, com) - self._resting
         length = np.linalg.norm(offset, axis=-1, keepdims=True)
         return offset * np.maximum(0, 1 - self._free / np.maximum(length, 1e-9))
 
@@ -65,10 +65,10 @@ class SupportCost(Cost):
 
     with c the centre of mass and its acceleration the mean over the horizon, from finite
     differences; and at the end of the extrapolation, where the robot shall be able to stand
-    still, the centre of mass itself. There the squared distance of the first tracked frame from
-    where it rests over the base counts too, beyond a free circle, with the weight `lean`: a
-    mobile robot shall drive after its goal, not bend. On flat ground the robot tips where z
-    leaves the area (Vukobratović and Borovac, 2004). The paper has no such term.
+    still, the centre of mass itself. There its squared distance beyond a free circle about where
+    it rests counts too, with the weight `lean`: a mobile robot shall drive after its goal, not
+    bend. On flat ground the robot tips where z leaves the area (Vukobratović and Borovac, 2004).
+    The paper has no such term.
 
     Args:
         area: The support area, None for a robot whose policy keeps the balance.
@@ -92,7 +92,5 @@ class SupportCost(Cost):
         base, com = evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
         resting = self.area.compute_excess(base, com)
         excess = np.square(moving).sum(-1).mean(-1) + np.square(resting).sum(-1)
-        lean = 0.0
-        for poses in list(evaluation.terminal_poses.values())[:1]:
-            lean = np.square(self.area.compute_lean(base, poses[:, :2])).sum(-1)
+        lean = np.square(self.area.compute_lean(base, com)).sum(-1)
         return evaluation.weights.support * excess + evaluation.weights.lean * lean
