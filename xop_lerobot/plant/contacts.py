@@ -53,11 +53,6 @@ class ContactTable:
         self._is_collision = table
         self._names = [_describe(model, geom) for geom in range(model.ngeom)]
 
-    @property
-    def support_geoms(self) -> tuple[int, ...]:
-        """Ids of the geoms that may touch the floor."""
-        return tuple(int(geom) for geom in np.flatnonzero(self._kind == _SUPPORT))
-
     def find_collisions(self, data: mujoco.MjData) -> set[tuple[str, str]]:
         """Names of the bodies in every collision of the robot, the floor by its geom's name."""
         if data.ncon == 0:
