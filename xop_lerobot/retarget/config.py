@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, field
 
 from xop_lerobot.errors import BadValue, UnknownName
 
 WEIGHTINGS = ("raw", "minmax", "ess")
+SAMPLINGS = ("gaussian", "antithetic", "sobol")
+KERNEL_MEANS = ("hold", "zero")
+SHIFTS = ("measured", "one")
 RETARGETERS = ("mpc", "direct")
 
 
@@ -51,14 +55,24 @@ class MpcConfig:
     """Model predictive controller of one robot in one mode.
 
     Attributes:
+        optimizer: Name of the sampling optimizer: `kmppi`, `cem`, or a registered one.
         num_samples: Rollouts per solve N, fixed candidates included [1].
         horizon: Length H of a rollout in low-level control steps of 20 ms [1].
         num_knots: Support points of the kernel interpolation [1].
         kernel_width: Width σ of the kernel [control steps].
+        kernel_mean: Mean of the interpolation: the last support value (`hold`), so that a steady
+            command stays, or `zero`, as in the original KMPPI.
+        shift: How far the plan moves between two solves: by the time that has passed
+            (`measured`), or by `one` control step whatever the time, as in the original.
+        sampling: How noise is drawn: `gaussian`, `antithetic` or `sobol`.
+        sample_plan: Whether the plan itself is the first sample.
         noise_std: Standard deviation of the samples by command name [its unit].
-        temperature: λ of weighting `raw` [cost], or of `minmax` [share of the cost's range].
-        effective_samples: Effective sample size that weighting `ess` aims at [1].
+        temperature: λ of weighting `raw` [cost], or of `minmax` [share of the cost's range];
+            also that of `importance_cost`.
+        effective_samples: Effective sample size that weighting `ess` aims at, and number of
+            elites of `cem` [1].
         weighting: How costs become weights: `raw`, `minmax` or `ess`.
+        importance_cost: Whether MPPI's importance-sampling term is part of the cost.
         min_noise: Share of `noise_std` that is left when the robot is at its goal [1].
         full_noise_error: Tracking error at which the noise is full [m, rad].
         control_hz: Solves per second of the robot's clock [Hz].
@@ -73,11 +87,17 @@ class MpcConfig:
     num_samples: int
     horizon: int
     noise_std: dict[str, float]
+    optimizer: str = "kmppi"
     num_knots: int = 1
     kernel_width: float = 2.0
+    kernel_mean: str = "hold"
+    shift: str = "measured"
+    sampling: str = "antithetic"
+    sample_plan: bool = True
     temperature: float = 0.05
     effective_samples: float = 4.0
     weighting: str = "ess"
+    importance_cost: bool = False
     min_noise: float = 0.15
     full_noise_error: float = 0.2
     control_hz: float = 25.0
@@ -88,11 +108,36 @@ class MpcConfig:
     weights: CostWeights = field(default_factory=CostWeights)
 
     def __post_init__(self) -> None:
-        if self.weighting not in WEIGHTINGS:
-            raise UnknownName("weighting", self.weighting, WEIGHTINGS)
+        for name, known in (
+            ("weighting", WEIGHTINGS),
+            ("sampling", SAMPLINGS),
+            ("kernel_mean", KERNEL_MEANS),
+            ("shift", SHIFTS),
+        ):
+            if getattr(self, name) not in known:
+                raise UnknownName(name, getattr(self, name), known)
+        for name in ("num_samples", "horizon", "num_knots", "effective_samples"):
+            _check_range(name, getattr(self, name), 1)
         for name in ("num_samples", "horizon", "num_knots"):
-            if getattr(self, name) < 1:
-                raise BadValue(f"{name} must be at least 1, got {getattr(self, name)}")
+            if getattr(self, name) != int(getattr(self, name)):
+                raise BadValue(f"{name} must be a whole number, got {getattr(self, name)}")
+        positive = ("kernel_width", "temperature", "full_noise_error", "control_hz")
+        for name in (*positive, "proposal_s", "reach"):
+            _check_positive(name, getattr(self, name))
+        for name in ("preview_s", "extrapolation_s", "min_noise"):
+            _check_range(name, getattr(self, name), 0)
+        for name, value in self.noise_std.items():
+            _check_range(f"noise_std of {name!r}", value, 0)
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise BadValue(f"{name} must be positive and finite, got {value}")
+
+
+def _check_range(name: str, value: float, low: float) -> None:
+    if not (math.isfinite(value) and value >= low):
+        raise BadValue(f"{name} must be at least {low}, got {value}")
 
 
 @dataclass
