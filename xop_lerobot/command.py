@@ -32,6 +32,12 @@ class CommandDim:
         neutral: Value at which the robot stands at rest [unit].
         max_rate: Largest change per second that the robot executes [unit/s].
         mobile_only: Whether the entry is held at `neutral` in stationary mode.
+        max_accel: Largest change of its rate per second that a teleoperation asks for [unit/s²];
+            None for no limit. `CommandSmoother` keeps it.
+
+    Raises:
+        BadValue: If the bounds are in the wrong order, `neutral` is not between them, or a limit
+            is not positive.
     """
 
     name: str
@@ -42,6 +48,18 @@ class CommandDim:
     neutral: float
     max_rate: float
     mobile_only: bool = False
+    max_accel: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.neutral <= self.high:
+            raise BadValue(
+                f"command {self.name!r} must have low <= neutral <= high, got {self.low}, "
+                f"{self.neutral}, {self.high}"
+            )
+        for limit in ("max_rate", "max_accel"):
+            value = getattr(self, limit)
+            if value is not None and not value > 0:
+                raise BadValue(f"{limit} of command {self.name!r} must be positive, got {value}")
 
 
 @dataclass(frozen=True)
@@ -91,6 +109,14 @@ class CommandSpace:
     def max_rate(self) -> np.ndarray:
         """Rate limits per second. Shape (k,)."""
         return self._column("max_rate")
+
+    @cached_property
+    def max_accel(self) -> np.ndarray:
+        """Largest changes of the rate per second, infinite where there is no limit. (k,)."""
+        limits = [np.inf if dim.max_accel is None else dim.max_accel for dim in self.dims]
+        column = np.array(limits, dtype=float)
+        column.setflags(write=False)
+        return column
 
     @cached_property
     def mobile_only(self) -> np.ndarray:

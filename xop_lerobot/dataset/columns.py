@@ -20,8 +20,11 @@ COST_NAMES = (
     "tracking", "stance", "collision", "control", "terminal", "support", "lateral", "fall", "total",
 )  # fmt: skip
 """Terms of `retargeter.cost`; a term that a retargeter does not have is 0."""
-HEALTH_NAMES = ("solve_time", "plan_age", "effective_samples", "sync_residual")
-"""Entries of `retargeter.health`: [s], [s], [1], [m]."""
+HEALTH_NAMES = (
+    "solve_time", "plan_age", "effective_samples", "status", "sync_residual", "sync_status",
+    "intervention", "risk",
+)  # fmt: skip
+"""Entries of `retargeter.health`; docs/recording.md says what they mean."""
 OWN_PREFIXES = ("operator.", "goal.", "retargeter.", "robot.", "time.", "next.")
 """What the keys of these columns begin with."""
 

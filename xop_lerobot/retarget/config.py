@@ -13,6 +13,9 @@ SAMPLINGS = ("gaussian", "antithetic", "sobol")
 KERNEL_MEANS = ("hold", "zero")
 SHIFTS = ("measured", "one")
 RETARGETERS = ("mpc", "direct")
+PRESETS = ("default", "conservative", "aggressive", "table1")
+CONSTRAINTS = ("upright",)
+"""Constraints that can be switched on and off while the robot is driven."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,13 @@ class CostWeights:
         stance: w_s, squared velocity of the points in contact [s²/m²].
         collision: w_c, proximity to obstacles [1].
         collision_velocity: w_v, speed near obstacles [s²/m²].
+        collision_decay: α, decay of the proximity with the distance [1/m].
+        collision_velocity_decay: β, decay of the speed's term with the distance [1/m].
+        collision_range: Distance from which an obstacle costs nothing; may be infinite [m].
+        upright: Squared tilt of each hand that is to stay level, while any is [1].
         control: w_a, squared deviation of the command from its reference, each entry over its
+            scale [1].
+        change: Squared change of the command from the one being executed, each entry over its
             scale [1].
         terminal: w_f, factor on the tracking cost at the end of the horizon [1].
         support: Squared distance of the zero-moment point out of the safe support area [1/m²].
@@ -42,7 +51,12 @@ class CostWeights:
     stance: float = 0.01
     collision: float = 1.0
     collision_velocity: float = 1.0
+    collision_decay: float = 10.0
+    collision_velocity_decay: float = 10.0
+    collision_range: float = 1.0
+    upright: float = 1.0
     control: float = 0.002
+    change: float = 0.0
     terminal: float = 2.0
     fall: float = 100.0
     support: float = 1000.0
@@ -151,6 +165,16 @@ class RetargeterConfig:
         control_hz: Solves per second; 0 takes the robot's own default.
         threads: Threads for the rollouts; 0 takes one per core.
         seed: Seed of the samples.
+        preset: Settings to start with: `default`, `conservative`, `aggressive` or `table1`.
+        sync: Whether the measured state is put in accordance with the ground before each tick.
+        variant: Binding of targets to the body to start with, one that the robot names (RB-Y1:
+            `v1`, `v2`); empty takes its first.
+        targets: Tracked frames that the retargeter follows, with commas between; empty takes
+            those of the variant.
+        body: What it may move for them: commands and arm joints, with commas between; empty
+            takes what the variant moves.
+        constraints: Constraints to start with, with commas between.
+        obstacles: YAML file of obstacles; empty takes the fixed boxes of the scene.
     """
 
     type: str = "mpc"
@@ -159,10 +183,22 @@ class RetargeterConfig:
     control_hz: float = 0.0
     threads: int = 0
     seed: int = 0
+    preset: str = "default"
+    sync: bool = True
+    variant: str = ""
+    targets: str = ""
+    body: str = ""
+    constraints: str = ""
+    obstacles: str = ""
 
     def __post_init__(self) -> None:
         if self.type not in RETARGETERS:
             raise UnknownName("retargeter", self.type, RETARGETERS)
+        if self.preset not in PRESETS:
+            raise UnknownName("preset", self.preset, PRESETS)
+        for name in split_names(self.constraints):
+            if name not in CONSTRAINTS:
+                raise UnknownName("constraint", name, CONSTRAINTS)
         for name in ("num_samples", "horizon", "control_hz", "threads"):
             if getattr(self, name) < 0:
                 raise BadValue(f"{name} must not be negative, got {getattr(self, name)}")
@@ -171,3 +207,8 @@ class RetargeterConfig:
     def num_threads(self) -> int:
         """Threads for the rollouts."""
         return self.threads or len(os.sched_getaffinity(0))
+
+
+def split_names(text: str) -> tuple[str, ...]:
+    """Names of a list with commas between; none for an empty text."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
