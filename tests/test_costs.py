@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from xop_lerobot.command import Mode
 from xop_lerobot.retarget.config import CostWeights
@@ -25,8 +21,9 @@ from xop_lerobot.retarget.costs import (
     SupportCost,
     TerminalCost,
     TrackingCost,
+    UprightCost,
 )
-from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
+from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.transforms import (
     heading_error,
     make_pose,
@@ -41,6 +38,7 @@ K, H, NQ, NV, NA = 5, 4, 9, 8, 3
 SITES = ("a", "b", "c")
 WEIGHTS = CostWeights(position=1.3, orientation=0.4, tilt_share=0.3, lateral=0.2)
 DT = 0.02
+SHAPING = ("collision_decay", "collision_velocity_decay", "collision_range")
 SQUARE = ((0.3, -0.2), (0.3, 0.2), (-0.3, 0.2), (-0.3, -0.2))
 
 
@@ -71,6 +69,7 @@ def make_evaluation(seed: int = 0, **fields) -> Evaluation:
         "mode": Mode.STATIONARY,
         "dt": DT,
         "weights": WEIGHTS,
+        "upright": ("left_wrist",),
     }
     names = {field.name for field in dataclasses.fields(Evaluation)}
     return Evaluation(**{name: (values | fields)[name] for name in names})
@@ -202,137 +201,6 @@ def test_wheels_may_roll_in_mobile_mode_only():
     cost = StanceCost((("a",), ("b",)), wheeled=True)
     np.testing.assert_array_equal(cost.compute(make_evaluation(mode=Mode.MOBILE)), np.zeros(K))
     assert (cost.compute(make_evaluation(mode=Mode.STATIONARY)) > 0).all()
-
-
-# -- collision -----------------------------------------------------------------------------
-
-BOX = Obstacle(
-    "box", np.array([0.5, -0.2, 0.4]), quat_from_rpy(0.2, 0.4, 0.9), np.array([0.3, 0.1, 0.2])
-)
-
-
-@given(st.tuples(*[st.floats(-1.5, 1.5)] * 3).map(np.array))
-def test_distance_to_a_box_equals_brute_force(point):
-    """The nearest of many points of the surface, in the box's own frame."""
-    surface = sample_surface(BOX.half_size, 25)
-    world = BOX.position + quat_rotate(BOX.quat, surface)
-    nearest = np.linalg.norm(world - point, axis=1).min()
-    distance = BOX.compute_distance(point)
-    assert abs(abs(distance) - nearest) < 0.02  # the spacing of the points
-
-
-def sample_surface(half: np.ndarray, count: int) -> np.ndarray:
-    grid = np.linspace(-1, 1, count)
-    u, v = (g.ravel() for g in np.meshgrid(grid, grid))
-    faces = []
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            face = np.stack([u, v], axis=1)
-            faces.append(np.insert(face, axis, sign, axis=1))
-    return np.concatenate(faces) * half
-
-
-@pytest.mark.parametrize(
-    "local, distance",
-    [
-        ([0.4, 0, 0], 0.1),  # beside a face
-        ([0.3, 0, 0], 0.0),  # on it
-        ([0.3 + 0.3, 0.1 + 0.4, 0], 0.5),  # over an edge, 3-4-5
-        ([0, 0, 0], -0.1),  # in the middle, to the nearest face
-        ([0.29, 0, 0], -0.01),
-    ],
-)
-def test_distance_to_a_box_by_hand(local, distance):
-    point = BOX.position + quat_rotate(BOX.quat, np.array(local))
-    assert BOX.compute_distance(point) == pytest.approx(distance, abs=1e-12)
-
-
-def test_distance_equals_mujocos():
-    model = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><geom name='box' type='box' pos='.5 -.2 .4' size='.3 .1 .2' "
-        "euler='10 20 30'/><body name='ball'><freejoint/><geom name='ball' size='.05'/></body>"
-        "</worldbody></mujoco>"
-    )
-    (box,) = make_obstacles(model)
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    for _ in range(50):
-        data.qpos[:3] = rng.uniform(-1, 1.5, 3)
-        mujoco.mj_kinematics(model, data)
-        expected = mujoco.mj_geomDistance(model, data, 0, 1, 10.0, None)
-        got = box.compute_distance(data.qpos[:3]) - 0.05
-        if expected > 0:  # depths are measured along other directions there
-            assert got == pytest.approx(expected, abs=1e-6)
-
-
-def test_obstacles_are_what_is_fixed_and_collides():
-    model = mujoco.MjModel.from_xml_string("""
-<mujoco><worldbody>
-  <geom name="floor" type="plane" size="5 5 1"/>
-  <geom name="wall" type="box" size="0.1 2 1" pos="3 0 1"/>
-  <geom name="picture" type="box" size="0.1 1 1" pos="2 0 1" contype="0" conaffinity="0"/>
-  <body pos="0 1 0.5" euler="0 0 90"><geom name="post" type="cylinder" size="0.1 0.5"/>
-    <body pos="0 0 0.6"><geom name="rail" type="capsule" size="0.05" fromto="0 0 0 1 0 0"/></body>
-  </body>
-  <body name="door"><joint axis="0 0 1"/><geom name="door" type="box" size="0.5 0.05 1"/></body>
-</worldbody></mujoco>""")
-    obstacles = {obstacle.name: obstacle for obstacle in make_obstacles(model)}
-    assert set(obstacles) == {"wall", "post", "rail"}
-    np.testing.assert_allclose(obstacles["wall"].position, [3, 0, 1])
-    np.testing.assert_allclose(obstacles["post"].half_size, [0.1, 0.1, 0.5])
-    # The rail leads along the world's Y from the post, 1 m and two caps long.
-    rail = obstacles["rail"]
-    np.testing.assert_allclose(rail.position, [0, 1.5, 1.1], atol=1e-9)
-    assert rail.compute_distance(np.array([0, 2.15, 1.1])) == pytest.approx(0.1)
-    assert rail.compute_distance(np.array([0.15, 1.5, 1.1])) == pytest.approx(0.1)
-
-
-def test_collision_equals_its_formula():
-    wall = Obstacle(
-        "wall", np.array([0.0, 2, 0]), np.array([1.0, 0, 0, 0]), np.array([3.0, 0.1, 3])
-    )
-    radii = {"a": 0.1, "b": 0.2}
-    e = make_evaluation(weights=CostWeights(collision=0.7, collision_velocity=1.9))
-    alpha, beta = 4.0, 6.0
-    expected = []
-    for i in range(K):
-        total = 0.0
-        for k in range(1, H + 1):
-            speed = e.qvel[i, k, 0] ** 2 + e.qvel[i, k, 1] ** 2
-            for box in (BOX, wall):
-                d = min(box.compute_distance(e.points[s][i, k]) - r for s, r in radii.items())
-                if d < 1:
-                    total += 0.7 * (math.exp(-alpha * d) - math.exp(-alpha))
-                    total += 1.9 * speed * (math.exp(-beta * d) - math.exp(-beta))
-        total /= H
-        for box in (BOX, wall):  # and once more at the end of the extrapolation
-            d = min(box.compute_distance(e.terminal_points[s][i]) - r for s, r in radii.items())
-            if d < 1:
-                total += 0.7 * (math.exp(-alpha * d) - math.exp(-alpha))
-                total += 1.9 * speed * (math.exp(-beta * d) - math.exp(-beta))
-        expected.append(total)
-    cost = CollisionCost((BOX, wall), radii, alpha, beta)
-    np.testing.assert_allclose(cost.compute(e), expected)
-
-
-def test_collision_is_nothing_far_away_and_grows_on_approach():
-    cost = CollisionCost((BOX,), {"a": 0.1})
-    costs = []
-    for distance in (1.2, 1.0, 0.5, 0.2, 0.0):
-        place = BOX.position + quat_rotate(BOX.quat, np.array([0.3 + 0.1 + distance, 0, 0]))
-        points = {"a": np.tile(place, (1, H + 1, 1))}
-        e = make_evaluation(
-            points=points, terminal_points={"a": place[None]}, qvel=np.zeros((1, H + 1, NV))
-        )
-        costs.append(cost.compute(e)[0] / 2)  # on the way, and at its end
-    assert costs[0] == 0
-    assert costs[1] == pytest.approx(0, abs=1e-12)
-    assert (np.diff(costs[1:]) > 0).all()
-    assert costs[-1] == pytest.approx(1, abs=1e-3)
-
-
-def test_without_obstacles_collision_is_free():
-    np.testing.assert_array_equal(CollisionCost((), {"a": 1.0}).compute(make_evaluation()), 0)
-    np.testing.assert_array_equal(CollisionCost((BOX,), {}).compute(make_evaluation()), 0)
 
 
 # -- control -------------------------------------------------------------------------------
@@ -488,6 +356,9 @@ def test_fall_does_not_count_the_start():
 
 # -- all of them ---------------------------------------------------------------------------
 
+BOX = Obstacle(
+    "box", np.array([0.5, -0.2, 0.4]), quat_from_rpy(0.2, 0.4, 0.9), np.array([0.3, 0.1, 0.2])
+)
 ALL = (
     TrackingCost(),
     TerminalCost(),
@@ -497,6 +368,7 @@ ALL = (
     SupportCost(SupportArea(SQUARE)),
     LateralCost(nonholonomic=True),
     FallCost(0.8, 0.35, 0.75),
+    UprightCost(),
 )
 
 
@@ -507,8 +379,9 @@ def test_costs_are_finite_positive_and_proportional_to_their_weight(cost):
     assert (value >= 0).all()
     assert (value > 0).any()
     doubled = {f.name: 2 * getattr(WEIGHTS, f.name) for f in dataclasses.fields(CostWeights)}
-    # The terminal weight is a factor on the tracking weights, tilt_share one on a part of them.
-    keep = {"tilt_share": WEIGHTS.tilt_share, "terminal": WEIGHTS.terminal}
+    # These are factors on other weights, or shape what is weighted.
+    names = ("tilt_share", "terminal", *SHAPING)
+    keep = {name: getattr(WEIGHTS, name) for name in names}
     weights = CostWeights(**(doubled | keep))
     np.testing.assert_allclose(cost.compute(make_evaluation(weights=weights)), 2 * value)
     nothing = CostWeights(**{name: 0.0 for name in doubled})

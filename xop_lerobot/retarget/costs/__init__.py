@@ -9,6 +9,7 @@ from xop_lerobot.retarget.costs.stance import StanceCost
 from xop_lerobot.retarget.costs.support import SupportArea, SupportCost
 from xop_lerobot.retarget.costs.terminal import TerminalCost
 from xop_lerobot.retarget.costs.tracking import TrackingCost
+from xop_lerobot.retarget.costs.upright import UprightCost
 
 __all__ = [
     "CollisionCost",
@@ -22,4 +23,5 @@ __all__ = [
     "SupportCost",
     "TerminalCost",
     "TrackingCost",
+    "UprightCost",
 ]

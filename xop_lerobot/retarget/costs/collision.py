@@ -2,62 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Mapping
 
-import mujoco
 import numpy as np
 
-from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import quat_conjugate, quat_rotate
+from xop_lerobot.retarget.obstacles import Obstacle, ObstacleSet, make_obstacles
 
-_RANGE = 1.0  # distance from which an obstacle costs nothing [m]
-
-
-@dataclass(frozen=True)
-class Obstacle:
-    """A box that stands still.
-
-    Attributes:
-        name: Its name.
-        position: Centre in the world [m]. Shape (3,).
-        quat: Orientation wxyz. Shape (4,).
-        half_size: Half its edges [m]. Shape (3,).
-    """
-
-    name: str
-    position: np.ndarray
-    quat: np.ndarray
-    half_size: np.ndarray
-
-    def compute_distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance of points to the box, negative inside [m]. (..., 3) -> (...)."""
-        local = quat_rotate(quat_conjugate(self.quat), points - self.position)
-        outside = np.abs(local) - self.half_size
-        outer = np.linalg.norm(np.maximum(outside, 0), axis=-1)
-        return outer + np.minimum(outside.max(-1), 0)
-
-
-def make_obstacles(model: mujoco.MjModel) -> tuple[Obstacle, ...]:
-    """Boxes of the colliding geoms that are fixed to the world, planes apart.
-
-    Round geoms count by their bounding box in their own frame.
-    """
-    obstacles = []
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    for i in range(model.ngeom):
-        fixed = model.body_weldid[model.geom_bodyid[i]] == 0
-        collides = model.geom_contype[i] or model.geom_conaffinity[i]
-        if not fixed or not collides or model.geom_type[i] == mujoco.mjtGeom.mjGEOM_PLANE:
-            continue
-        quat = np.empty(4)
-        mujoco.mju_mat2Quat(quat, data.geom_xmat[i])
-        centre, half = model.geom_aabb[i, :3], model.geom_aabb[i, 3:]
-        position = data.geom_xpos[i] + quat_rotate(quat, centre)
-        obstacles.append(Obstacle(model.geom(i).name, position, quat, half.copy()))
-    return tuple(obstacles)
+__all__ = ["CollisionCost", "Obstacle", "make_obstacles"]
 
 
 class CollisionCost(Cost):
@@ -66,55 +19,82 @@ class CollisionCost(Cost):
     The same barrier counts once more at the end of the extrapolation: the horizon alone is too
     short to brake before a wall.
 
-    :math:`d_j` is the least distance of the robot's body points to obstacle j, v the velocity
-    of the base. Obstacles beyond one metre cost nothing: the term is cut off there smoothly, so
-    that far walls do not push.
+    :math:`d_j` is the least distance of the robot's hull to obstacle j, v the velocity of the
+    base. At `collision_range` both terms are cut off smoothly, by the value that they have
+    there, so that far walls do not push; with an infinite range it is the paper's formula.
 
     Args:
         obstacles: What to keep clear of.
         points: Sites on the hull of the robot and the radius around each [m].
-        alpha: Decay of the proximity term [1/m].
-        beta: Decay of the velocity term [1/m].
     """
 
     name = "collision"
 
-    def __init__(
-        self,
-        obstacles: tuple[Obstacle, ...],
-        points: dict[str, float],
-        alpha: float = 10.0,
-        beta: float = 10.0,
-    ) -> None:
-        self.obstacles, self.points, self.alpha, self.beta = obstacles, points, alpha, beta
+    def __init__(self, obstacles: Iterable[Obstacle], points: Mapping[str, float]) -> None:
+        self.points = dict(points)
+        self._radii = np.array(list(self.points.values()))
+        self.set_obstacles(obstacles)
+
+    def set_obstacles(self, obstacles: Iterable[Obstacle]) -> None:
+        """Take another set of obstacles, from the next solve on."""
+        self.obstacles = ObstacleSet(obstacles)
 
     def compute(self, evaluation: Evaluation) -> np.ndarray:
         """Cost of every sample. Shape (K,)."""
-        if not self.obstacles or not self.points:
-            return np.zeros(len(evaluation.qpos))
+        num = len(evaluation.qpos)
+        if not len(self.obstacles) or not self.points:
+            return np.zeros(num)
+        # The first step is the start, which no command changes; the extrapolation comes last.
+        hull = np.concatenate(
+            [
+                self._stack(evaluation.points)[:, 1:],
+                self._stack(evaluation.terminal_points)[:, None],
+            ],
+            axis=1,
+        )  # (K, H + 1, P, 3)
+        weights = evaluation.weights
+        near = self.obstacles.find_near(hull, weights.collision_range + self._radii.max())
+        if not len(near):
+            return np.zeros(num)
+        distances = self._compute_distances(hull, near)  # (K, H + 1, n)
         speed = np.square(evaluation.qvel[:, 1:, :2]).sum(-1)
-        moving = self._compute_barrier(evaluation.points, speed, evaluation.weights)
-        resting = self._compute_barrier(
-            evaluation.terminal_points, speed[:, -1], evaluation.weights
+        speed = np.concatenate([speed, speed[:, -1:]], axis=1)
+        barrier = weights.collision * _compute_barrier(
+            distances, weights.collision_decay, weights.collision_range
+        ) + weights.collision_velocity * speed * _compute_barrier(
+            distances, weights.collision_velocity_decay, weights.collision_range
         )
-        return moving.mean(axis=1) + resting
+        return barrier[:, :-1].mean(axis=1) + barrier[:, -1]
 
-    def _compute_barrier(
-        self, points: Mapping[str, np.ndarray], speed: np.ndarray, weights: CostWeights
+    def compute_clearance(
+        self, points: Mapping[str, np.ndarray], which: np.ndarray | None = None
     ) -> np.ndarray:
-        """Barriers of all obstacles, at the steps that `speed` is for. Shape of `speed`."""
-        radii = np.array(list(self.points.values()))
-        positions = [points[site] for site in self.points]
-        if speed.ndim > 1:  # the first step is the start, which no command changes
-            positions = [position[:, 1:] for position in positions]
-        hull = np.stack(positions, axis=-2)
-        total = np.zeros(speed.shape)
-        for obstacle in self.obstacles:
-            distance = (obstacle.compute_distance(hull) - radii).min(axis=-1)
-            for weight, decay in (
-                (weights.collision, self.alpha),
-                (weights.collision_velocity * speed, self.beta),
-            ):
-                barrier = np.exp(-decay * distance) - np.exp(-decay * _RANGE)
-                total += weight * np.maximum(barrier, 0)
-        return total
+        """Least distance of the hull to any obstacle on the way [m]; infinite without any.
+
+        Args:
+            points: Positions of the hull's sites over the steps, others are not used, as in
+                `Evaluation.points`. Shapes (K, ..., 3).
+            which: Obstacles of interest; all by default. Shape (n,), int.
+
+        Returns:
+            Distance of every sample, negative inside. Shape (K,).
+        """
+        num = len(next(iter(points.values())))
+        if not len(self.obstacles) or not self.points or (which is not None and not len(which)):
+            return np.full(num, np.inf)
+        return self._compute_distances(self._stack(points), which).reshape(num, -1).min(axis=1)
+
+    def _stack(self, points: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Positions of the hull's sites. Shape (..., P, 3)."""
+        return np.stack([points[site] for site in self.points], axis=-2)
+
+    def _compute_distances(self, hull: np.ndarray, which: np.ndarray | None) -> np.ndarray:
+        """Distance of the whole hull to each obstacle [m]. (..., P, 3) -> (..., n)."""
+        distances = self.obstacles.compute_distances(hull, which)  # (..., P, n)
+        return (distances - self._radii[:, None]).min(axis=-2)
+
+
+def _compute_barrier(distances: np.ndarray, decay: float, cut_off: float) -> np.ndarray:
+    """Sum over obstacles of the barrier, zero from `cut_off` [m] on. (..., n) -> (...)."""
+    offset = math.exp(-decay * cut_off) if math.isfinite(cut_off) else 0.0
+    return np.maximum(np.exp(-decay * distances) - offset, 0).sum(axis=-1)

@@ -34,6 +34,7 @@ class Evaluation:
         mode: Mode of the robot.
         dt: Time between steps [s].
         weights: The weights.
+        upright: Tracked frames whose hand is to stay level.
     """
 
     qpos: np.ndarray
@@ -53,6 +54,7 @@ class Evaluation:
     mode: Mode
     dt: float
     weights: CostWeights
+    upright: tuple[str, ...] = ()
 
 
 class Cost(ABC):

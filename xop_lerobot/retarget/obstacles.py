@@ -1,0 +1,198 @@
+"""Obstacles: what stands around the robot, and exact distances to all of it at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.transforms import quat_conjugate, quat_rotate
+
+SHAPES = ("box", "sphere", "cylinder", "capsule")
+_GEOMS = {
+    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): "sphere",
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
+}
+_GROUND = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A solid that stands still.
+
+    Attributes:
+        name: Its name.
+        position: Centre in the world [m]. Shape (3,).
+        quat: Orientation wxyz; cylinders and capsules lie along their Z. Shape (4,).
+        half_size: Half the edges of the box around it, along its own axes [m]: of a cylinder
+            r, r, l/2, and the caps of a capsule belong to its length. Shape (3,).
+        shape: One of `SHAPES`.
+    """
+
+    name: str
+    position: np.ndarray
+    quat: np.ndarray
+    half_size: np.ndarray
+    shape: str = "box"
+
+    def __post_init__(self) -> None:
+        if self.shape not in SHAPES:
+            raise UnknownName("shape of an obstacle", self.shape, SHAPES)
+        if not (np.asarray(self.half_size) > 0).all():
+            raise BadValue(f"obstacle '{self.name}': sizes must be positive, got {self.half_size}")
+
+    def compute_distance(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance of points to the surface, negative inside [m]. (..., 3) -> (...).
+
+        The plain formula of each shape; `ObstacleSet` does the same for many at once.
+        """
+        local = np.abs(quat_rotate(quat_conjugate(self.quat), points - self.position))
+        radius, half = self.half_size[0], self.half_size[2]
+        if self.shape == "sphere":
+            return np.linalg.norm(local, axis=-1) - radius
+        if self.shape == "capsule":
+            beyond = np.maximum(local - [0, 0, half - radius], [-np.inf, -np.inf, 0])
+            return np.linalg.norm(beyond, axis=-1) - radius
+        if self.shape == "cylinder":
+            across = np.hypot(local[..., 0], local[..., 1])
+            outside = np.stack([across - radius, local[..., 2] - half], axis=-1)
+        else:
+            outside = local - self.half_size
+        outer = np.linalg.norm(np.maximum(outside, 0), axis=-1)
+        return outer + np.minimum(outside.max(-1), 0)
+
+
+class ObstacleSet:
+    r"""Signed distances of many points to many obstacles in one pass, with no loop over either.
+
+    With :math:`q = |R_j^\top(p - c_j)|`, for a cylinder :math:`q = (\sqrt{q_x^2 + q_y^2}, 0, q_z)`,
+    every shape is a core of half sizes :math:`h_j`, rounded by :math:`r_j`:
+
+    .. math:: d_j(p) = \|\max(q - h_j, 0)\| + \min(\max_i(q - h_j)_i, 0) - r_j.
+
+    A sphere has a point for its core, a capsule a line, box and cylinder are not rounded.
+
+    Args:
+        obstacles: The obstacles.
+    """
+
+    def __init__(self, obstacles: Iterable[Obstacle] = ()) -> None:
+        self.obstacles = tuple(obstacles)
+        rows = [_make_row(obstacle) for obstacle in self.obstacles]
+        self._axes = np.array([row[0] for row in rows]).reshape(-1, 3, 3)  # (J, 3, 3)
+        self._centres = np.array([row[1] for row in rows]).reshape(-1, 3)
+        self._cores = np.array([row[2] for row in rows]).reshape(-1, 3)
+        self._radii = np.array([row[3] for row in rows])
+        self._round = np.array([each.shape == "cylinder" for each in self.obstacles], dtype=bool)
+
+    def __len__(self) -> int:
+        return len(self.obstacles)
+
+    def find_near(self, points: np.ndarray, distance: float) -> np.ndarray:
+        """Obstacles that any of `points` may be nearer to than `distance` [m].
+
+        A distance changes by no more than the point moves; so those farther from the middle of
+        the points than `distance` and the farthest point are out of question.
+
+        Args:
+            points: Points. Shape (..., 3).
+            distance: How near [m].
+
+        Returns:
+            Their indices. Shape (n,).
+        """
+        flat = points.reshape(-1, 3)
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        if not np.isfinite(low + high).all():  # a sample that diverged
+            return np.arange(len(self))
+        spread = float(np.linalg.norm(high - low)) / 2
+        return np.flatnonzero(self.compute_distances((low + high) / 2) < distance + spread)
+
+    def compute_distances(self, points: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
+        """Signed distances, negative inside [m].
+
+        Args:
+            points: Points in the world [m]. Shape (..., 3).
+            which: Obstacles of interest; all by default. Shape (n,), int.
+
+        Returns:
+            Distance of every point to every obstacle. Shape (..., n).
+        """
+        which = np.arange(len(self)) if which is None else which
+        axes, num = self._axes[which], len(which)
+        flat = points.reshape(-1, 3)
+        turned = flat @ axes.transpose(1, 0, 2).reshape(3, 3 * num)  # R^T p of all at once
+        offsets = np.einsum("jab,ja->jb", axes, self._centres[which])
+        local = np.abs(turned.reshape(len(flat), num, 3) - offsets)
+        cylinders = self._round[which]
+        if cylinders.any():
+            across = np.hypot(local[:, cylinders, 0], local[:, cylinders, 1])
+            local[:, cylinders, 0], local[:, cylinders, 1] = across, 0
+        outside = local - self._cores[which]
+        x, y, z = np.moveaxis(np.maximum(outside, 0), -1, 0)
+        depth = np.maximum(np.maximum(outside[..., 0], outside[..., 1]), outside[..., 2])
+        distances = np.sqrt(x * x + y * y + z * z) + np.minimum(depth, 0) - self._radii[which]
+        return distances.reshape(*points.shape[:-1], num)
+
+
+def _make_row(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Axes (columns), centre, half sizes of the core, and its rounding."""
+    axes = quat_rotate(obstacle.quat, np.eye(3)).T
+    half, radius = np.array(obstacle.half_size, dtype=float), 0.0
+    if obstacle.shape in ("sphere", "capsule"):
+        radius = float(half[0])
+        half = np.array([0.0, 0, half[2] - radius])
+    elif obstacle.shape == "cylinder":
+        half[1] = np.inf  # the second axis is folded into the first
+    return axes, np.asarray(obstacle.position, float), half, radius
+
+
+def make_obstacles(
+    model: mujoco.MjModel, movable: Iterable[str] = (), data: mujoco.MjData | None = None
+) -> tuple[Obstacle, ...]:
+    """Solid geoms that are fixed to the world, the ground (planes, height fields) apart.
+
+    Boxes, spheres, cylinders and capsules are exact; meshes and ellipsoids count by the box
+    around them.
+
+    Args:
+        model: Model of the scene; the robot in it moves, so it is none.
+        movable: Bodies that count too, where they are.
+        data: Where they are; by default where the model starts.
+
+    Raises:
+        UnknownName: If there is no such body; carries those that move.
+    """
+    if data is None:
+        data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    bodies = {model.body(i).name: i for i in range(model.nbody) if model.body_weldid[i]}
+    wanted = set()
+    for name in movable:
+        if name not in bodies:
+            raise UnknownName("movable body", name, bodies)
+        wanted.add(int(model.body_weldid[bodies[name]]))
+    obstacles = []
+    for i in range(model.ngeom):
+        weld = int(model.body_weldid[model.geom_bodyid[i]])
+        solid = model.geom_contype[i] or model.geom_conaffinity[i]
+        if (weld and weld not in wanted) or not solid or model.geom_type[i] in _GROUND:
+            continue
+        obstacles.append(_make_obstacle(model, data, i))
+    return tuple(obstacles)
+
+
+def _make_obstacle(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Obstacle:
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, data.geom_xmat[geom])
+    # geom_aabb is the box around the geom in its own frame: centre, half sizes.
+    centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    position = data.geom_xpos[geom] + quat_rotate(quat, centre)
+    shape = _GEOMS.get(int(model.geom_type[geom]), "box")
+    name = model.geom(geom).name or model.body(model.geom_bodyid[geom]).name or f"geom {geom}"
+    return Obstacle(name, position, quat, half.copy(), shape)
