@@ -9,8 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.retarget.costs import CollisionCost
+from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.obstacle_file import BadObstacles, load_obstacles
 from xop_lerobot.retarget.obstacles import SHAPES, Obstacle, ObstacleSet, make_obstacles
 from xop_lerobot.transforms import quat_exp, quat_from_rpy, quat_rotate
@@ -286,3 +290,21 @@ def test_a_file_that_is_not_there_or_no_yaml(tmp_path):
     assert str(raised.value) == expected
     with pytest.raises(BadObstacles, match="is no YAML"):
         load_obstacles(write(tmp_path, "obstacles: ["))
+
+
+def test_a_file_adds_to_the_scene(tmp_path):
+    morphology = make_morphology("rby1")
+    model = build_model(morphology, "planning")
+    scene = make_obstacles(build_model(morphology, "full", scene="room"))
+    config = RetargeterConfig(threads=1, obstacles=write(tmp_path, FILE))
+    retargeter = make_retargeter(config, morphology, make_policy("diff_drive"), model, scene)
+    (collision,) = (cost for cost in retargeter.costs if isinstance(cost, CollisionCost))
+    names = [obstacle.name for obstacle in collision.obstacles.obstacles]
+    assert names == [
+        *(obstacle.name for obstacle in scene),
+        "wall",
+        "pillar",
+        "sphere_3",
+        "capsule_4",
+    ]
+    retargeter.close()
