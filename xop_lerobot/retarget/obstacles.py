@@ -124,20 +124,23 @@ class ObstacleSet:
             Distance of every point to every obstacle. Shape (..., n).
         """
         which = np.arange(len(self)) if which is None else which
-        axes, num = self._axes[which], len(which)
-        flat = points.reshape(-1, 3)
-        turned = flat @ axes.transpose(1, 0, 2).reshape(3, 3 * num)  # R^T p of all at once
-        offsets = np.einsum("jab,ja->jb", axes, self._centres[which])
-        local = np.abs(turned.reshape(len(flat), num, 3) - offsets)
+        axes, cores = self._axes[which], self._cores[which]
+        # Components come first, points last: every pass is over contiguous numbers.
+        turned = np.einsum("jab->bja", axes).reshape(-1, 3) @ points.reshape(-1, 3).T
+        local = turned.reshape(3, len(which), points[..., 0].size)
+        local -= np.einsum("jab,ja->bj", axes, self._centres[which])[..., None]
+        np.abs(local, out=local)
         cylinders = self._round[which]
         if cylinders.any():
-            across = np.hypot(local[:, cylinders, 0], local[:, cylinders, 1])
-            local[:, cylinders, 0], local[:, cylinders, 1] = across, 0
-        outside = local - self._cores[which]
-        x, y, z = np.moveaxis(np.maximum(outside, 0), -1, 0)
-        depth = np.maximum(np.maximum(outside[..., 0], outside[..., 1]), outside[..., 2])
-        distances = np.sqrt(x * x + y * y + z * z) + np.minimum(depth, 0) - self._radii[which]
-        return distances.reshape(*points.shape[:-1], num)
+            local[0, cylinders] = np.hypot(local[0, cylinders], local[1, cylinders])
+            local[1, cylinders] = 0
+        local -= cores.T[..., None]
+        depth = np.minimum(np.maximum(np.maximum(local[0], local[1]), local[2]), 0)
+        np.maximum(local, 0, out=local)
+        np.square(local, out=local)
+        distances = np.sqrt(local[0] + local[1] + local[2]) + depth
+        distances -= self._radii[which][:, None]
+        return distances.T.reshape(*points.shape[:-1], len(which))
 
 
 def _make_row(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
