@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
@@ -12,6 +13,7 @@ import numpy as np
 from xop_lerobot.command import ActionLayout, CommandSpace, Mode, RobotAction
 from xop_lerobot.morphology.effect import Effect
 from xop_lerobot.registry import Registry
+from xop_lerobot.retarget.config import PaperParameters
 
 if TYPE_CHECKING:
     import mujoco
@@ -36,6 +38,29 @@ class ArmChain:
     joints: tuple[str, ...]
     gripper: str | None = None
     gripper_range: tuple[float, float] = (0.0, 0.0)
+
+
+PAPER_HUMANOID = {
+    Mode.STATIONARY: PaperParameters(30, 3, 0.001, 25.0),
+    Mode.MOBILE: PaperParameters(30, 5, 0.05, 10.0),
+}
+"""The paper's Table I for its humanoid."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Which tracked frames drive which part of the body.
+
+    Attributes:
+        targets: Tracked frames that the retargeter follows; the arms' inverse kinematics follow
+            the other wrists.
+        body: Command entries and arm joints that it decides; empty for the whole command.
+        paper: The paper's parameters in each mode, for the preset `table1`.
+    """
+
+    targets: tuple[str, ...] = ("head",)
+    body: tuple[str, ...] = ()
+    paper: Mapping[Mode, PaperParameters] = field(default_factory=lambda: PAPER_HUMANOID)
 
 
 class Morphology(ABC):
@@ -65,6 +90,8 @@ class Morphology(ABC):
     wheeled: bool
     """Whether it stands on wheels (contact points roll, the base stays level)."""
 
+    variants: Mapping[str, Variant] = {"v1": Variant()}
+    """Bindings of targets to the body by name; the first is the default."""
     effects: tuple[Effect, ...]
     """What each entry of the command does, in the order of `command_space`."""
     contact_groups: tuple[tuple[str, ...], ...]

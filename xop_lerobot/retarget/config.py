@@ -12,6 +12,8 @@ WEIGHTINGS = ("raw", "minmax", "ess")
 SAMPLINGS = ("gaussian", "antithetic", "sobol")
 KERNEL_MEANS = ("hold", "zero")
 SHIFTS = ("measured", "one")
+CANDIDATES = ("proposal", "direct", "previous", "stop")
+CONTROL_REFERENCES = ("proposal", "neutral", "zero")
 RETARGETERS = ("mpc", "direct")
 PRESETS = ("default", "conservative", "aggressive", "table1")
 CONSTRAINTS = ("upright",)
@@ -95,6 +97,11 @@ class MpcConfig:
         reach: Distance at which a goal that runs away is held [m]; beyond it more error would
             only contort the robot.
         proposal_s: Time in which the kinematic candidate wants to be at the goal [s].
+        candidates: Fixed commands that are tried beside the samples: the kinematic `proposal`,
+            the `direct` mapping, the `previous` command, which is still executed, and `stop`.
+        control_reference: Command from which the control cost counts: the `proposal`, `neutral`,
+            or `zero` as in the paper.
+        observe_drift: Whether a steady drift of a walking base is observed and counted on.
         weights: Cost weights.
     """
 
@@ -119,6 +126,9 @@ class MpcConfig:
     extrapolation_s: float = 0.4
     proposal_s: float = 0.6
     reach: float = 0.6
+    candidates: tuple[str, ...] = ("proposal", "previous", "stop")
+    control_reference: str = "proposal"
+    observe_drift: bool = True
     weights: CostWeights = field(default_factory=CostWeights)
 
     def __post_init__(self) -> None:
@@ -127,9 +137,13 @@ class MpcConfig:
             ("sampling", SAMPLINGS),
             ("kernel_mean", KERNEL_MEANS),
             ("shift", SHIFTS),
+            ("control_reference", CONTROL_REFERENCES),
         ):
             if getattr(self, name) not in known:
                 raise UnknownName(name, getattr(self, name), known)
+        for name in self.candidates:
+            if name not in CANDIDATES:
+                raise UnknownName("candidate", name, CANDIDATES)
         for name in ("num_samples", "horizon", "num_knots", "effective_samples"):
             _check_range(name, getattr(self, name), 1)
         for name in ("num_samples", "horizon", "num_knots"):
@@ -142,6 +156,23 @@ class MpcConfig:
             _check_range(name, getattr(self, name), 0)
         for name, value in self.noise_std.items():
             _check_range(f"noise_std of {name!r}", value, 0)
+
+
+@dataclass(frozen=True)
+class PaperParameters:
+    """What the paper's Table I gives for one robot and mode; the rest is common to all.
+
+    Attributes:
+        num_samples: N [1].
+        horizon: H [20 ms].
+        noise_std: Standard deviation of the samples, one for all entries [their unit].
+        control_hz: Solves per second [Hz].
+    """
+
+    num_samples: int
+    horizon: int
+    noise_std: float
+    control_hz: float
 
 
 def _check_positive(name: str, value: float) -> None:
@@ -174,7 +205,7 @@ class RetargeterConfig:
         body: What it may move for them: commands and arm joints, with commas between; empty
             takes what the variant moves.
         constraints: Constraints to start with, with commas between.
-        obstacles: YAML file of obstacles; empty takes the fixed boxes of the scene.
+        obstacles: YAML file of obstacles, which adds to what is fixed in the scene.
     """
 
     type: str = "mpc"

@@ -8,9 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
-from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
+from xop_lerobot.morphology.morphology import (
+    MORPHOLOGIES,
+    ArmChain,
+    ModelKind,
+    Morphology,
+    Variant,
+)
 from xop_lerobot.morphology.rby1.links import LINKS
 from xop_lerobot.morphology.rby1.mpc import EFFECTS, HULL, PIVOT, SUPPORT, mpc_config
+from xop_lerobot.retarget.config import PaperParameters
 
 if TYPE_CHECKING:
     import mujoco
@@ -76,6 +83,23 @@ class RBY1(Morphology):
     }
     contact_points = ("left_wheel_center", "right_wheel_center")
     contact_groups = (("left_wheel_center",), ("right_wheel_center",))
+    variants = {
+        "v1": Variant(
+            paper={
+                Mode.STATIONARY: PaperParameters(30, 3, 0.01, 25.0),
+                Mode.MOBILE: PaperParameters(30, 10, 0.01, 10.0),
+            }
+        ),
+        # The left hand alone drives torso and left arm; the paper gives it no mode.
+        "v2": Variant(
+            targets=("left_wrist",),
+            body=(
+                *(f"torso_{i}" for i in range(len(TORSO_READY))),
+                *(f"left_arm_{i}" for i in range(len(ARM_READY))),
+            ),
+            paper=dict.fromkeys(Mode, PaperParameters(50, 3, 0.01, 25.0)),
+        ),
+    }
     effects = EFFECTS
     pivot = PIVOT
     support = SUPPORT

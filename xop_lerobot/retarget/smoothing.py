@@ -1,0 +1,90 @@
+"""Limits the change of rate of every command, so that what is asked for can be followed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.command import CommandSpace, Mode, check_vector
+
+
+class CommandSmoother:
+    r"""Brings a command to where it is wanted within its bounds, rates and changes of rate.
+
+    .. math:: |a_n - a_{n-1}| \le \dot a_{max}\,dt, \qquad
+              |a_n - 2 a_{n-1} + a_{n-2}| \le \ddot a_{max}\,dt^2
+
+    It brakes in time: a wanted command that stands still is reached without overshoot, and a
+    bound is never passed. Velocities stop just so when the mode becomes stationary; therefore
+    the robot is told of that mode only once they are at rest (`smooth`).
+
+    Args:
+        space: The command space; entries without a `max_accel` are limited in their rate alone.
+        dt: Control period [s].
+    """
+
+    def __init__(self, space: CommandSpace, dt: float) -> None:
+        self.space, self.dt = space, dt
+        self._reach = space.max_rate * dt  # largest step
+        self._gain = space.max_accel * dt * dt  # largest change of the step
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was sent: the next command starts from rest."""
+        self._sent: np.ndarray | None = None
+        self._step = np.zeros(len(self.space))
+
+    def smooth(self, command: np.ndarray, mode: Mode, executed: np.ndarray) -> np.ndarray:
+        """Compute the command to send after `executed`; `note` what became of it.
+
+        Args:
+            command: Wanted command. Shape (k,).
+            mode: Mode that is wanted.
+            executed: Command being executed. Shape (k,).
+
+        Returns:
+            The command to send. Shape (k,).
+        """
+        space = self.space
+        command = check_vector("command", command, len(space))
+        wanted = np.where(space.mobile_only & (mode == Mode.STATIONARY), space.neutral, command)
+        wanted = np.clip(wanted, space.low, space.high)
+        if self._sent is None or not np.array_equal(executed, self._sent):
+            self._step = np.zeros(len(space))  # somebody else drove the robot
+        step = np.clip(wanted - executed, -self._reach, self._reach)
+        step = np.sign(step) * np.minimum(
+            np.abs(step), compute_braking_step(np.abs(wanted - executed), self._gain)
+        )
+        step = np.clip(step, self._step - self._gain, self._step + self._gain)
+        # What still moves towards a bound must be able to stop there.
+        rise = compute_braking_step(np.maximum(space.high - executed, 0), self._gain)
+        fall = compute_braking_step(np.maximum(executed - space.low, 0), self._gain)
+        step = np.clip(step, -np.minimum(fall, self._reach), np.minimum(rise, self._reach))
+        return executed + step
+
+    def is_at_rest(self, command: np.ndarray) -> bool:
+        """Whether the velocities of `command` are neutral, as in stationary mode. Shape (k,)."""
+        moving = self.space.mobile_only & (np.abs(command - self.space.neutral) > 1e-9)
+        return not moving.any()
+
+    def note(self, executed: np.ndarray, sent: np.ndarray) -> None:
+        """Take down what was sent in the end. Shapes (k,)."""
+        self._step, self._sent = sent - executed, np.array(sent)
+
+
+def compute_braking_step(distance: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    r"""Largest step from which one can stop within `distance`, by `gain` less in each step.
+
+    With n steps to go, :math:`\sum_{i<n} (s - i g) = d` gives :math:`s = d/n + (n - 1) g/2`; n
+    is the least for which the last step is not negative.
+
+    Args:
+        distance: Distance d to the place to stop at, not negative. Shape (k,).
+        gain: Largest change g of the step; infinite for no limit. Shape (k,).
+
+    Returns:
+        The step, at most `distance`. Shape (k,).
+    """
+    limited = np.isfinite(gain)
+    g = np.where(limited, gain, 1.0)
+    n = 1 + np.floor((np.sqrt(1 + 8 * distance / g) - 1) / 2 * (1 + 1e-12))
+    return np.where(limited, distance / n + (n - 1) * g / 2, distance)
