@@ -1,0 +1,246 @@
+"""State synchronisation: the simulator's state that the measurements and the contacts agree on."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import mink
+import mujoco
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.sensor_filter import SensorFilter
+from xop_lerobot.retarget.sync_config import SyncConfig, SyncStatus
+from xop_lerobot.retarget.sync_contacts import make_contacts
+from xop_lerobot.retarget.sync_task import SyncTask
+from xop_lerobot.retarget.velocity_projection import ContactVelocity, project_velocity
+from xop_lerobot.state import freeze
+
+logger = logging.getLogger(__name__)
+
+_DAMPING = 1e-9
+_BOUND_SLACK = 1e-9  # how far beyond a joint limit a step may end [rad]
+
+
+@dataclass(frozen=True)
+class Synced:
+    """A synchronised state.
+
+    Attributes:
+        qpos: Generalised position, MuJoCo order; read-only. Shape (nq,).
+        qvel: Generalised velocity, MuJoCo order; read-only. Shape (nv,).
+        residual: Root mean square, over the rows of all active contacts, of the position residual
+            that is left [m]; 0 without one.
+        status: How the solve ended.
+        iterations: Steps of the SQP.
+        correction: How far the base was moved from its measurement [m].
+        rotation: How far the base was turned from its measurement [rad].
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    residual: float
+    status: SyncStatus
+    iterations: int
+    correction: float = 0.0
+    rotation: float = 0.0
+
+
+class StateSync:
+    r"""Solves Eq. 4 each tick: the state the planner's simulator starts from.
+
+    Args:
+        morphology: The robot.
+        model: Its planning model.
+        config: How much each sensor and contact is trusted.
+
+    Attributes:
+        failures: Number of ticks that fell back to the measurement since the last `reset`.
+        bounded: Number of steps for which DAQP was needed since the last `reset`.
+    """
+
+    def __init__(
+        self, morphology: Morphology, model: mujoco.MjModel, config: SyncConfig | None = None
+    ) -> None:
+        self.morphology, self.model = morphology, model
+        self.config = config = config or SyncConfig()
+        wheeled = morphology.wheeled
+        self.contacts = make_contacts(morphology, model, equilibrium=config.equilibrium)
+        self.task = SyncTask(model, self.contacts, wheeled, config)
+        self._contact_velocity = ContactVelocity(model, self.contacts, wheeled, config)
+        self._configuration = mink.Configuration(model)
+        self._limit = mink.ConfigurationLimit(model, gain=1.0)
+        limited = model.jnt_limited.astype(bool)
+        limited &= model.jnt_type != mujoco.mjtJoint.mjJNT_FREE
+        self._limited_qpos = model.jnt_qposadr[limited]
+        self._limited_dofs = model.jnt_dofadr[limited]
+        self._range = model.jnt_range[limited]
+        scale = self.task.joint_scale
+        self._velocity_std = np.concatenate(
+            [[config.velocity] * 3, [config.gyro] * 3, config.joint_rate * scale]
+        )
+        position_std = np.concatenate(
+            [[config.position] * 3, [config.tilt] * 2, [config.heading], config.joint * scale]
+        )
+        self._filter = SensorFilter(model, position_std, self._velocity_std, config.gate)
+        self.failures = self.bounded = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past: the robot may be anywhere now."""
+        self.failures = self.bounded = 0
+        self._last: Synced | None = None
+        self._last_time = -np.inf
+        self._forget()
+
+    def _forget(self) -> None:
+        self._filter.reset()
+        self._stance = np.full((len(self.contacts), 3), np.nan)
+        self._stance_age = np.zeros(len(self.contacts))
+        self._mode: Mode | None = None
+        self._active: tuple[int, ...] = ()
+
+    def synchronise(self, time: float, qpos: np.ndarray, qvel: np.ndarray, mode: Mode) -> Synced:
+        """Find the state that measurement, contacts and memory agree on; never raises.
+
+        Args:
+            time: Clock of the robot [s].
+            qpos: Measured generalised position. Shape (nq,).
+            qvel: Measured generalised velocity. Shape (nv,).
+            mode: Mode the robot is in: which contacts count.
+
+        Returns:
+            The state; the measurement with status `MEASUREMENT` where there is no solution, and
+            the last good state where the measurement is not finite.
+        """
+        try:
+            if not (np.isfinite(qpos).all() and np.isfinite(qvel).all() and np.isfinite(time)):
+                return self._fall_back(qpos, qvel)
+            self._last = self._solve(float(time), np.asarray(qpos), np.asarray(qvel), mode)
+        except (mink.MinkError, np.linalg.LinAlgError, ValueError, TypeError):
+            logger.debug("state synchronisation failed", exc_info=True)
+            self._forget()
+            return self._fall_back(qpos, qvel)
+        return self._last
+
+    def _fall_back(self, qpos: np.ndarray, qvel: np.ndarray) -> Synced:
+        self.failures += 1
+        finite = bool(np.isfinite(qpos).all() and np.isfinite(qvel).all())
+        if not finite and self._last is not None:
+            qpos, qvel = self._last.qpos, self._last.qvel
+        return Synced(freeze(qpos), freeze(qvel), 0.0, SyncStatus.MEASUREMENT, 0)
+
+    def _solve(self, time: float, qpos: np.ndarray, qvel: np.ndarray, mode: Mode) -> Synced:
+        dt = time - self._last_time
+        if not 0 < dt <= self.config.max_gap_s or not self.config.recursive:
+            self._forget()
+        measured, restarted = qpos, False
+        if self.config.recursive:
+            velocity = qvel if self._last is None else 0.5 * (self._last.qvel + qvel)
+            measured, restarted = self._filter.update(qpos, velocity, dt)
+        configuration = self._configuration
+        configuration.update(measured)
+        if restarted or mode is not self._mode:
+            self._stance[:] = np.nan
+        self._activate(configuration.data, mode)
+        self.task.set_measurement(measured, self._filter.std if self.config.recursive else None)
+        self.task.set_active(self._active, self._stance)
+        iterations, bounded = self._descend()
+        if self.config.project_velocity:
+            jacobian, std = self._contact_velocity.compute_jacobian(
+                configuration.data, self._active
+            )
+            qvel = project_velocity(qvel, self._velocity_std, jacobian, std)
+        self._remember(time, mode)
+        errors = self.task.compute_contact_position_errors(configuration)
+        status = SyncStatus.BOUNDED if bounded else SyncStatus.OK
+        solution = configuration.data.qpos
+        return Synced(
+            qpos=freeze(solution),
+            qvel=freeze(qvel),
+            residual=float(np.sqrt(np.mean(np.square(errors)))) if errors.size else 0.0,
+            status=SyncStatus.RESTARTED if restarted else status,
+            iterations=iterations,
+            correction=float(np.linalg.norm(solution[:3] - qpos[:3])),
+            rotation=_compute_angle(solution[3:7], qpos[3:7]),
+        )
+
+    def _activate(self, data: mujoco.MjData, mode: Mode) -> None:
+        """Find the contacts that count: all wheels, both feet, or the lower foot while mobile."""
+        everyone = tuple(range(len(self.contacts)))
+        if self.morphology.wheeled or mode is Mode.STATIONARY:
+            self._active = everyone
+        else:
+            heights = [
+                data.xpos[c.body][2] + data.xmat[c.body][6:9] @ c.point - c.height
+                for c in self.contacts
+            ]
+            self._active = (int(np.argmin(heights)),)
+        for index in everyone:
+            if index not in self._active:
+                self._stance[index] = np.nan
+
+    def _descend(self) -> tuple[int, bool]:
+        """SQP from where the configuration is.
+
+        Returns:
+            Steps taken, and whether a joint limit held the last one.
+        """
+        bounded, iterations = False, 0
+        while iterations < self.config.iterations:
+            step, bounded = self._compute_step()
+            self._configuration.integrate_inplace(step, 1.0)
+            iterations += 1
+            if np.abs(step).max() < self.config.tolerance:
+                break
+        return iterations, bounded
+
+    def _compute_step(self) -> tuple[np.ndarray, bool]:
+        r"""One step of the SQP: :math:`\min_d \frac12 d^\top H d + c^\top d` within limits.
+
+        H is positive definite; if the minimum without limits lies within them, it is the
+        minimum with them, and DAQP is not asked.
+        """
+        jacobian, error, _ = self.task.compute_qp_residual(self._configuration)
+        hessian = jacobian.T @ jacobian
+        hessian.flat[:: len(hessian) + 1] += _DAMPING
+        step = np.linalg.solve(hessian, error @ jacobian)
+        reached = self._configuration.data.qpos[self._limited_qpos] + step[self._limited_dofs]
+        if not (
+            (reached < self._range[:, 0] - _BOUND_SLACK)
+            | (reached > self._range[:, 1] + _BOUND_SLACK)
+        ).any():
+            return step, False
+        self.bounded += 1
+        step = mink.solve_ik(
+            self._configuration,
+            [self.task],
+            1.0,
+            solver="daqp",
+            damping=_DAMPING,
+            limits=[self._limit],
+        )
+        return step, True
+
+    def _remember(self, time: float, mode: Mode) -> None:
+        """Take the synchronised feet into their mean place, forgetting what is long ago."""
+        dt = min(time - self._last_time, self.config.max_gap_s)
+        self._last_time, self._mode = time, mode
+        if self.morphology.wheeled or not self.config.recursive:
+            return
+        places = self.task.compute_places(self._configuration.data)
+        for index in self._active:
+            if np.isnan(self._stance[index, 0]):
+                self._stance[index], self._stance_age[index] = places[index], dt
+                continue
+            self._stance_age[index] = min(self._stance_age[index] + dt, self.config.memory_s)
+            change = places[index] - self._stance[index]
+            change[2] = np.arctan2(np.sin(change[2]), np.cos(change[2]))
+            self._stance[index] += dt / self._stance_age[index] * change
+
+
+def _compute_angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle between two orientations [rad]."""
+    return 2 * float(np.arccos(min(1.0, abs(float(a @ b)))))

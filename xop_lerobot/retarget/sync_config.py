@@ -1,0 +1,90 @@
+"""Settings and statuses of the state synchronisation; loads no physics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from enum import IntEnum
+
+from xop_lerobot.errors import BadValue
+
+
+class SyncStatus(IntEnum):
+    """How one synchronisation ended."""
+
+    OK = 0
+    """The optimum lies within the joint limits."""
+    BOUNDED = 1
+    """The optimum lies on at least one joint limit."""
+    RESTARTED = 2
+    """The measurement had left what was remembered, which was begun anew from it."""
+    MEASUREMENT = 3
+    """Not solved: the measurement, or the last good state if it is not finite."""
+
+
+@dataclass(frozen=True)
+class SyncConfig:
+    """How much each sensor and each contact is trusted, as standard deviations.
+
+    The sensors' defaults are those of a good lidar odometry and clean encoders (noise preset
+    `mild`); only ratios matter.
+
+    Attributes:
+        position: Measured position of the base [m].
+        heading: Measured heading of the base [rad].
+        tilt: Measured roll and pitch of the base [rad].
+        joint: Measured joint angle [rad], a tenth of it in metres on sliding joints.
+        velocity: Measured linear velocity of the base [m/s].
+        gyro: Measured angular velocity of the base [rad/s].
+        joint_rate: Measured joint velocity [rad/s], a tenth in m/s on sliding joints.
+        contact_height: Height of a contact point over its equilibrium [m].
+        contact_tilt: Tilt of a foot over the ground, or of an axle [rad].
+        stance_position: Remembered place of a standing foot [m].
+        stance_heading: Remembered heading of a standing foot [rad].
+        contact_velocity: Velocity of a point in contact [m/s].
+        contact_rate: Angular velocity of a standing foot, roll and pitch rate on wheels [rad/s].
+        memory_s: Time over which the place of a standing foot is averaged [s].
+        gate: Disagreement of measurement and memory at which the memory is begun anew, in
+            standard deviations [1].
+        max_gap_s: Time without a measurement after which memory is worthless [s].
+        iterations: Most steps of the SQP.
+        tolerance: Largest entry of a step under which the SQP has converged [m, rad].
+        recursive: Whether anything is remembered from tick to tick; without, each solve sees
+            its own measurement alone (Eq. 4 as the paper has it, but for the stance location).
+        project_velocity: Whether the velocity is projected on the stance constraint.
+        equilibrium: Whether contacts are as deep in the ground as the robot's weight presses
+            them; without, points touch it at z = 0.
+    """
+
+    position: float = 0.01
+    heading: float = math.radians(0.5)
+    tilt: float = math.radians(0.5)
+    joint: float = 0.005
+    velocity: float = 0.03
+    gyro: float = 0.02
+    joint_rate: float = 0.1
+    contact_height: float = 0.0005
+    contact_tilt: float = 0.002
+    stance_position: float = 0.001
+    stance_heading: float = 0.003
+    contact_velocity: float = 0.005
+    contact_rate: float = 0.02
+    memory_s: float = 2.0
+    gate: float = 4.0
+    max_gap_s: float = 0.2
+    iterations: int = 4
+    tolerance: float = 1e-5
+    recursive: bool = True
+    project_velocity: bool = True
+    equilibrium: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            BadValue: Naming the setting and what it must be.
+        """
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if not isinstance(value, bool) and not (math.isfinite(value) and value > 0):
+                raise BadValue(f"sync setting '{setting.name}' must be over 0, got {value}")
