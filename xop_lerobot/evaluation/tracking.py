@@ -1,0 +1,297 @@
+"""Closed-loop tracking: a scenario's goals drive a robot in lock-step, and the truth is measured.
+
+The whole of teleoperation is in the loop, state synchronisation, retargeter, arm kinematics and
+limits, but for two parts: no person, and no alignment. Goals are given in the robot's world, so
+that an error is the robot's and not that of where it believed to be when it was engaged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from xop_lerobot.errors import UnknownName
+from xop_lerobot.evaluation.tracking_metrics import Trajectory, compute_metrics
+from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, GoalTrack, Scenario
+from xop_lerobot.evaluation.tracking_setup import (
+    TrackingSetup,
+    compute_physics_steps,
+    make_retargeter_config,
+    make_tuned_morphology,
+)
+from xop_lerobot.link import RobotInfo
+from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
+from xop_lerobot.operator.device import Device
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.plant.config import SimulationConfig
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.state import FRAMES
+from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+from xop_lerobot.transforms import (
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_from_yaw,
+)
+
+OPEN_PINCH = 0.1  # distance of thumb and index of an open hand [m]
+
+
+class GoalDevice(Device):
+    """An operator who has the goals themselves as head and hands, in the robot's world.
+
+    Args:
+        scenario: The scenario.
+        track: Its goals.
+        wrists: Poses of the wrists at home. Shapes (7,).
+    """
+
+    self_engaging = True
+
+    def __init__(
+        self, scenario: Scenario, track: GoalTrack, wrists: Mapping[str, np.ndarray]
+    ) -> None:
+        self.start_mode = scenario.mode
+        self.track = track
+        home = pose_inverse(_level(track.home))
+        self._from_head = {name: pose_multiply(home, pose) for name, pose in wrists.items()}
+        self._start: float | None = None
+
+    def start(self, time: float) -> None:
+        """Start the track's clock."""
+        self._start = time
+
+    def clock(self, time: float) -> float:
+        """Track's clock at `time` of the robot's; 0 before the start [s]."""
+        return 0.0 if self._start is None else time - self._start
+
+    def read(self, time: float) -> OperatorFrame:
+        """The goals at `time`."""
+        clock = self.clock(time)
+        head = self.track.head_at(clock)
+        return OperatorFrame(
+            time=clock,
+            head=head,
+            left_wrist=self._compute_wrist("left_wrist", head, clock),
+            right_wrist=self._compute_wrist("right_wrist", head, clock),
+            pinch=np.full(2, OPEN_PINCH),
+            mode=self.start_mode,
+        )
+
+    def _compute_wrist(self, name: str, head: np.ndarray, clock: float) -> np.ndarray:
+        """A wrist goes with the head's place and heading. Shape (7,)."""
+        wrist = self._from_head[name]
+        reach = self.track.reach
+        if reach is not None and clock >= self.track.reach_start:
+            side = 1.0 if name == "left_wrist" else -1.0
+            wrist = make_pose(reach * np.array([1, side, 1]), wrist[3:])
+        return pose_multiply(_level(head), wrist)
+
+
+class WorldAlignment(Alignment):
+    """No alignment: what the operator does is wanted in the robot's world as it is."""
+
+    def __init__(self) -> None:
+        super().__init__(AlignmentConfig(height_scale=1.0, reach_scale=1.0))
+        self._engaged = False
+
+    @property
+    def is_engaged(self) -> bool:
+        """Whether goals are given."""
+        return self._engaged
+
+    def engage(
+        self,
+        frame: OperatorFrame,
+        robot_frames: Mapping[str, np.ndarray],
+        robot_head_height: float,
+    ) -> None:
+        """Begin to give goals."""
+        del frame, robot_frames, robot_head_height
+        self._engaged = True
+
+    def disengage(self) -> None:
+        """Give no goals."""
+        self._engaged = False
+
+    def goal_poses(self, frame: OperatorFrame) -> dict[str, np.ndarray]:
+        """The operator's poses. Shapes (7,)."""
+        return {name: frame.pose(name).copy() for name in FRAMES}
+
+
+def _level(pose: np.ndarray) -> np.ndarray:
+    return make_pose(pose[:3], quat_from_yaw(compute_heading(pose[3:])))
+
+
+class _Truth:
+    """Where the robot truly is: tracked frames, and the middle of each foot or wheel."""
+
+    def __init__(self, morphology: Morphology) -> None:
+        self._frames = morphology.frames
+        self._groups = morphology.contact_groups
+        points = tuple(point for group in self._groups for point in group)
+        model = build_model(morphology, "planning")
+        self._kinematics = SiteKinematics(model, (*self._frames.values(), *points))
+
+    def compute_frames(self, qpos: np.ndarray) -> dict[str, np.ndarray]:
+        """Poses of the tracked frames. Shapes (7,)."""
+        poses = self._kinematics.compute_poses(qpos)
+        return {name: poses[site] for name, site in self._frames.items()}
+
+    def compute_feet(self, qpos: np.ndarray) -> np.ndarray:
+        """Middle of each foot. Shape (f, 3)."""
+        poses = self._kinematics.compute_poses(qpos)
+        return np.array(
+            [np.mean([poses[point][:3] for point in group], axis=0) for group in self._groups]
+        )
+
+
+def get_scenario(name: str) -> Scenario:
+    """Look the scenario `name` up.
+
+    Raises:
+        UnknownName: Listing the known ones.
+    """
+    if name not in SCENARIOS:
+        raise UnknownName("scenario", name, SCENARIOS)
+    return SCENARIOS[name]
+
+
+def run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory]:
+    """Run one scenario in lock-step.
+
+    Args:
+        setup: What to run.
+        seed: Seed of sensors, samples and random goals.
+
+    Returns:
+        The goals, and what happened.
+    """
+    scenario = get_scenario(setup.scenario)
+    morphology = make_tuned_morphology(setup)
+    low_level = setup.low_level or morphology.policies[0]
+    config = SimulationConfig(scene=scenario.scene, noise=setup.resolved_noise, seed=seed)
+    loop = PolicyLoop(morphology, Simulation(morphology, config), make_policy(low_level))
+    info = RobotInfo(morphology.name, morphology, low_level, None, scenario.scene, setup.fps, seed)
+    retargeter = make_retargeter_config(setup, seed)
+    teleoperation = Teleoperation(TeleoperationConfig(retargeter=retargeter), info)
+    try:
+        loop.reset(seed)
+        truth = _Truth(morphology)
+        frames = truth.compute_frames(loop.state.true_qpos)
+        home = frames["head"]
+        home = make_pose(home[:3], quat_from_yaw(compute_heading(home[3:])))
+        rng = np.random.default_rng((seed, 7))
+        track = scenario.build(home, rng, setup.hold, setup.goals)
+        wrists = {name: frames[name] for name in FRAMES[1:]}
+        teleoperation.device = GoalDevice(scenario, track, wrists)
+        teleoperation.alignment = WorldAlignment()
+        teleoperation.reset()
+        return track, _drive(loop, teleoperation, truth, track)
+    finally:
+        teleoperation.disconnect()
+        loop.close()
+
+
+def _drive(
+    loop: PolicyLoop, teleoperation: Teleoperation, truth: _Truth, track: GoalTrack
+) -> Trajectory:
+    """Close the loop for the length of the track, and write down what is true."""
+    rows: dict[str, list[Any]] = {
+        name: []
+        for name in (
+            "time", "head", "goal", "base", "command", "feet", "hands", "fallen", "collision"
+        )
+    }  # fmt: skip
+    solves: list[float] = []
+    contacts: set[tuple[str, str]] = set()
+    device = teleoperation.device
+    assert isinstance(device, GoalDevice)
+    dt, plan_age = teleoperation.dt, np.inf
+    while True:
+        state = loop.state
+        clock = device.clock(state.time)
+        if clock >= track.duration - dt / 2:
+            break
+        action, record = teleoperation.step(state)
+        frames = truth.compute_frames(state.true_qpos)
+        goals = record.goal.poses if record.goal is not None else {}
+        if goals or clock > 0:
+            rows["time"].append(clock)
+            rows["head"].append(frames["head"])
+            rows["goal"].append(goals.get("head", track.head_at(clock)))
+            rows["base"].append(state.true_qpos[:7])
+            rows["command"].append(action.command)
+            rows["feet"].append(truth.compute_feet(state.true_qpos))
+            rows["hands"].append(
+                [
+                    np.linalg.norm(goals[name][:3] - frames[name][:3]) if goals else np.nan
+                    for name in FRAMES[1:]
+                ]
+            )
+            rows["fallen"].append(state.fallen)
+            rows["collision"].append(state.collision)
+            plan_age = record.health.get("plan_age", np.inf)
+            if plan_age == 0:
+                solves.append(record.health["solve_time"])
+        if state.fallen:
+            break
+        loop.execute(action, dt)
+        contacts.update(loop.plant.measure().contacts)
+    return Trajectory(
+        **{name: np.array(values) for name, values in rows.items()},
+        solve_s=np.array(solves),
+        contacts=tuple(sorted(contacts)),
+    )
+
+
+def run_trial(setup: TrackingSetup, seed: int) -> dict[str, Any]:
+    """Run one scenario and compute its figures.
+
+    Returns:
+        ``setup``, ``seed``, ``metrics``, ``samples``, ``horizon``, ``control_hz``,
+        ``physics_steps_per_s``, ``contacts``, ``wall_s`` and more, all fit for JSON: what never
+        came, as an arrival, is None.
+    """
+    start = perf_counter()
+    track, trajectory = run_scenario(setup, seed)
+    return make_record(setup, seed, track, trajectory, perf_counter() - start)
+
+
+def make_record(
+    setup: TrackingSetup, seed: int, track: GoalTrack, trajectory: Trajectory, wall_s: float
+) -> dict[str, Any]:
+    """Put the figures of a run and what it ran with in one place, fit for JSON."""
+    scenario = get_scenario(setup.scenario)
+    metrics = compute_metrics(track, trajectory, scenario.get_tolerance(setup.robot))
+    config = make_tuned_morphology(setup).mpc_config(scenario.mode)
+    return {
+        "robot": setup.robot,
+        "scenario": setup.scenario,
+        "ablation": setup.ablation,
+        "noise": setup.resolved_noise,
+        "sync": setup.sync,
+        "preset": setup.preset,
+        "seed": seed,
+        "hold": setup.hold,
+        "samples": config.num_samples,
+        "horizon": config.horizon,
+        "control_hz": config.control_hz,
+        "physics_steps_per_s": compute_physics_steps(config, SimulationConfig().time_step),
+        "sim_s": float(trajectory.time[-1]),
+        "wall_s": round(wall_s, 1),
+        "contacts": [" - ".join(pair) for pair in trajectory.contacts],
+        "metrics": {
+            name: value if math.isfinite(value) else None for name, value in metrics.items()
+        },
+    }

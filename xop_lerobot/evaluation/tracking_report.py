@@ -1,0 +1,262 @@
+"""Results of the tracking benchmark: kept in a JSON file, summed up in tables, put in the docs."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, Scenario
+
+Run = Mapping[str, Any]
+
+
+class Results:
+    """Runs by key in a JSON file; what is there need not run again.
+
+    Args:
+        path: The file; it is written anew after every run. None keeps nothing.
+        fresh: Whether to begin with none of its runs.
+    """
+
+    def __init__(self, path: Path | None, *, fresh: bool = False) -> None:
+        self.path = path
+        self.runs: dict[str, dict[str, Any]] = {}
+        if path is not None and path.exists() and not fresh:
+            self.runs = read_runs(path)
+
+    def add(self, key: str, run: dict[str, Any]) -> None:
+        """Keep a run, on disk at once."""
+        self.runs[key] = run
+        if self.path is None:
+            return
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        part = self.path.with_suffix(".part")
+        content = {"machine": describe_machine(), "runs": self.runs}
+        part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        part.replace(self.path)
+
+
+def read_runs(path: Path) -> dict[str, dict[str, Any]]:
+    """Read the runs of a results file.
+
+    Raises:
+        BadValue: If it is none.
+    """
+    try:
+        return json.loads(path.read_text())["runs"]
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise BadValue(f"'{path}' holds no results of the tracking benchmark: {error!r}") from error
+
+
+def describe_machine() -> dict[str, str]:
+    """Processor, cores and versions: what figures travel with."""
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                model = line.partition(":")[2].strip()
+                break
+    packages = ("mujoco", "numpy", "mink", "onnxruntime")
+    return {
+        "processor": model,
+        "cores": str(len(os.sched_getaffinity(0))),
+        "python": platform.python_version(),
+        **{name: version(name) for name in packages},
+    }
+
+
+# -- tables --------------------------------------------------------------------------------------
+
+STATIONARY_COLUMNS = {
+    "at 1.5 s [cm]": "at_limit_cm",
+    "[°]": "at_limit_deg",
+    "after, p95 [cm]": "after_p95_cm",
+    "p95 [°]": "after_p95_deg",
+    "1 s mean, worst [cm]": "after_mean_max_cm",
+    "worst [°]": "after_mean_max_deg",
+    "foot [cm]": "foot_cm",
+}
+MOBILE_COLUMNS = {
+    "late [s]": "late_s",
+    "after, p95 [cm]": "after_p95_cm",
+    "worst [cm]": "after_max_cm",
+    "p95 [°]": "after_p95_deg",
+    "1 s mean, worst [cm]": "after_mean_max_cm",
+    "worst [°]": "after_mean_max_deg",
+}
+CURVE_COLUMNS = {
+    "mean [cm]": "moving_mean_cm",
+    "p95 [cm]": "moving_p95_cm",
+    "worst [cm]": "moving_max_cm",
+    "whole run, mean [cm]": "moving_whole_mean_cm",
+    "mean [°]": "moving_mean_deg",
+}
+ROOM_COLUMNS = {
+    "goals": "goals",
+    "with contact": "collided_goals",
+    "arrived": "arrived_goals",
+}
+ARMS_COLUMNS = {
+    "after, p95 [cm]": "after_p95_cm",
+    "final [cm]": "final_cm",
+    "hands, median [cm]": "hand_cm",
+    "tilt, worst [°]": "tilt_deg",
+}
+SUMMED = ("falls", "collisions", "goals", "collided_goals", "arrived_goals")
+ABLATION_COLUMNS = {
+    "final [cm]": "final_mean_cm",
+    "[°]": "final_mean_deg",
+    "after, p95 [cm]": "after_p95_cm",
+    "moving, mean [cm]": "moving_mean_cm",
+}
+
+
+def get_columns(scenario: Scenario) -> dict[str, str]:
+    """Figures by heading that tell a run of `scenario`."""
+    special = {"curve": CURVE_COLUMNS, "room": ROOM_COLUMNS, "arms": ARMS_COLUMNS}
+    if scenario.name in special:
+        return special[scenario.name]
+    return STATIONARY_COLUMNS if scenario.mode is Mode.STATIONARY else MOBILE_COLUMNS
+
+
+def compute_median_and_worst(runs: Sequence[Run], metric: str) -> tuple[float, float]:
+    """Median and largest of a figure over runs; what never came counts as infinite."""
+    values = [run["metrics"].get(metric) for run in runs]
+    numbers = np.array([math.inf if value is None else value for value in values], dtype=float)
+    if not numbers.size:
+        return math.nan, math.nan
+    ordered = np.sort(numbers)  # np.median of infinities is NaN
+    middle = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    median = middle[0] if middle[0] == middle[1] else sum(middle) / 2
+    return float(median), float(ordered[-1])
+
+
+def format_number(value: float) -> str:
+    """A figure with two digits that tell something; ``never`` for an infinite one."""
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "never"
+    return f"{value:.0f}" if abs(value) >= 100 or value == round(value) else f"{value:.1f}"
+
+
+def format_cell(runs: Sequence[Run], metric: str) -> str:
+    """``median / worst`` of a figure, or its sum where it is a count."""
+    if metric in SUMMED:
+        return format_number(sum(run["metrics"][metric] for run in runs))
+    if all(metric not in run["metrics"] for run in runs):
+        return "–"
+    median, worst = compute_median_and_worst(runs, metric)
+    return f"{format_number(median)} / {format_number(worst)}"
+
+
+def make_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def select(runs: Mapping[str, Run], **wanted: Any) -> list[Run]:
+    """Runs whose entries are as wanted, in order of their seeds."""
+    found = [run for run in runs.values() if all(run[k] == v for k, v in wanted.items())]
+    return sorted(found, key=lambda run: run["seed"])
+
+
+def make_scenario_table(
+    runs: Mapping[str, Run], robot: str, names: Sequence[str], ablation: str = "default"
+) -> str:
+    """Table of scenarios of one kind, a row each; cells are ``median / worst`` over the seeds.
+
+    Raises:
+        UnknownName: If there is no such scenario.
+    """
+    rows, columns = [], {}
+    for name in names:
+        if name not in SCENARIOS:
+            raise UnknownName("scenario", name, SCENARIOS)
+        scenario = SCENARIOS[name]
+        columns = get_columns(scenario)
+        found = select(runs, robot=robot, scenario=name, ablation=ablation)
+        if found:
+            cells = [format_cell(found, metric) for metric in columns.values()]
+            falls, seeds = format_cell(found, "falls"), str(len(found))
+            rows.append([scenario.title, *cells, falls, seeds])
+    return make_table(["goal", *columns, "falls", "seeds"], rows)
+
+
+def make_ablation_table(
+    runs: Mapping[str, Run], robot: str, scenarios: Sequence[str], ablations: Mapping[str, Any]
+) -> str:
+    """Table of variants, a row each, over all runs of `scenarios`; cells as in the others.
+
+    A figure that a scenario does not have leaves that scenario out of its column.
+    """
+    rows = []
+    for name, ablation in ablations.items():
+        found = [
+            run
+            for scenario in scenarios
+            for run in select(runs, robot=robot, scenario=scenario, ablation=name)
+        ]
+        if not found:
+            continue
+        cells = []
+        for metric in ABLATION_COLUMNS.values():
+            cells.append(format_cell([run for run in found if metric in run["metrics"]], metric))
+        steps = sorted({round(run["physics_steps_per_s"]) for run in found})
+        label = " and ".join(str(step) for step in steps)
+        rows.append(
+            [
+                f"`{name}`: {ablation.title}",
+                *cells,
+                format_cell(found, "falls"),
+                label,
+                str(len(found)),
+            ]
+        )
+    return make_table(["variant", *ABLATION_COLUMNS, "falls", "physics steps/s", "runs"], rows)
+
+
+# -- documents -----------------------------------------------------------------------------------
+
+
+def fill_document(text: str, blocks: Mapping[str, Callable[[], str] | str]) -> str:
+    """Put blocks between the markers ``<!-- begin NAME -->`` and ``<!-- end NAME -->``.
+
+    Raises:
+        BadValue: If a block has no pair of markers in `text`.
+    """
+    for name, block in blocks.items():
+        begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+        head, found, rest = text.partition(begin)
+        _, closed, tail = rest.partition(end)
+        if not (found and closed):
+            raise BadValue(f"the document has no '{begin}' with '{end}' after it")
+        content = block if isinstance(block, str) else block()
+        text = f"{head}{begin}\n{content}\n{end}{tail}"
+    return text
+
+
+def describe_run(key: str, run: Run) -> str:
+    """One line of a run's key figures."""
+    columns = get_columns(SCENARIOS[run["scenario"]])
+    cells = []
+    for heading, metric in {**columns, "falls": "falls", "solve [ms]": "solve_ms"}.items():
+        value = run["metrics"].get(metric)
+        number = "never" if value is None and metric in run["metrics"] else value
+        text = format_number(number) if isinstance(number, int | float) else str(number)
+        cells.append(f"{heading} {text}")
+    name = "/".join(key.split("/")[:-1])
+    touched = f"; touched {', '.join(run['contacts'][:4])}" if run["contacts"] else ""
+    return f"{name}: {', '.join(cells)}{touched} ({run['wall_s']:.0f} s)"

@@ -1,0 +1,311 @@
+"""Scenarios of the tracking benchmark: where the head shall be, and how well it must be there.
+
+All goals are laid out in the heading frame of the head at the start ("home"): X forward, Y left,
+Z up. A goal that steps is held from its start on; the time to arrive counts from the step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.transforms import (
+    make_pose,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+)
+
+LEAD_IN_S = 1.0
+"""Time for which the first goal is the pose at home [s]."""
+WALK_SPEED = 0.5
+"""Speed of the direct path that arrival times are compared with [m/s]."""
+ARRIVAL_S = 3.0
+"""Time that a mobile robot may take longer than the direct path [s]."""
+STATIONARY_S = 1.5
+"""Time in which a stationary robot shall arrive [s]."""
+CURVE_SPEED = 0.3
+"""Speed of the moving goal [m/s]."""
+CURVE_TURN = 0.3
+"""Largest turn rate of the moving goal [rad/s]: a radius of 1 m."""
+CURVE_PERIOD = 16.0
+"""Time in which the moving goal turns left and right once [s]."""
+CURVE_S = 20.0
+"""Length of the moving goal's path [s]."""
+WAIST = np.array([-0.05, 0.0, -0.42])
+"""Where a person's waist is from the head, in the heading frame [m]: bends turn about it."""
+ROOM_HALF = 4.0
+"""Half the width of the scene `room`, between the walls' faces [m]."""
+WALL_DISTANCE = 0.25
+"""Distance of the room's goals from the nearest wall [m]."""
+ROOM_HOLD_S = 1.0
+"""How long each of the room's goals is held after it should have been reached [s]."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What counts as being there.
+
+    Attributes:
+        position: Largest position error [m].
+        angle: Largest angle of the orientation error [rad].
+    """
+
+    position: float
+    angle: float
+
+
+@dataclass(frozen=True)
+class GoalStep:
+    """One goal that is held.
+
+    Attributes:
+        start: When it becomes the goal, on the track's clock [s].
+        head: Pose of the head in the world. Shape (7,).
+        direct_s: Time of the direct path to it [s].
+        limit_s: Time after `start` in which the robot shall be there [s].
+    """
+
+    start: float
+    head: np.ndarray
+    direct_s: float
+    limit_s: float
+
+
+@dataclass(frozen=True)
+class GoalTrack:
+    """What the operator asks for over time.
+
+    Attributes:
+        home: Pose of the head at the start. Shape (7,).
+        duration: Length [s].
+        steps: Goals that are held, in order of time; empty for a goal that moves.
+        path: The moving goal's pose at a time, None for goals that step.
+        reach: Place of the left wrist from the head, in the head's heading frame; the right one
+            mirrors it. None leaves the wrists where they are at home [m].
+        reach_start: When the wrists go there [s].
+    """
+
+    home: np.ndarray
+    duration: float
+    steps: tuple[GoalStep, ...] = ()
+    path: Callable[[float], np.ndarray] | None = None
+    reach: np.ndarray | None = None
+    reach_start: float = LEAD_IN_S
+
+    def head_at(self, time: float) -> np.ndarray:
+        """Pose of the head's goal at `time` [s] of the track's clock. Shape (7,)."""
+        if self.path is not None:
+            return self.path(time)
+        head = self.home
+        for step in self.steps:
+            if time >= step.start - 1e-9:
+                head = step.head
+        return head
+
+
+Builder = Callable[[np.ndarray, np.random.Generator, float, int], GoalTrack]
+"""Makes a track from home (7,), a generator, the time to hold [s] and the number of goals."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One scenario of the benchmark.
+
+    Attributes:
+        name: Name on the command line.
+        title: What happens, for tables.
+        mode: Mode of the robot.
+        build: Makes the track.
+        scene: Scene the robot stands in.
+        tolerances: What counts as being there, by robot; ``""`` for every other robot.
+    """
+
+    name: str
+    title: str
+    mode: Mode
+    build: Builder
+    scene: str = "empty"
+    tolerances: dict[str, Tolerance] = field(default_factory=dict)
+
+    def get_tolerance(self, robot: str) -> Tolerance:
+        """What counts as being there for `robot`."""
+        return self.tolerances.get(robot, self.tolerances[""])
+
+
+STATIONARY_TOLERANCE = {"": Tolerance(0.02, math.radians(3))}
+MOBILE_TOLERANCE = {
+    "": Tolerance(0.05, math.radians(3)),
+    "rby1": Tolerance(0.02, math.radians(1)),
+}
+
+
+def move_from(home: np.ndarray, offset: tuple[float, float, float], yaw: float = 0) -> np.ndarray:
+    """Pose that is `offset` [m] and `yaw` [rad] away from home, in its heading frame. (7,)."""
+    heading = quat_from_yaw(compute_heading(home[3:]))
+    position = home[:3] + quat_rotate(heading, np.array(offset))
+    return make_pose(position, quat_multiply(quat_from_yaw(yaw), home[3:]))
+
+
+def bend_from(home: np.ndarray, pitch: float = 0, yaw: float = 0) -> np.ndarray:
+    """Pose of a head whose owner turns by `pitch` and `yaw` [rad] about the waist. Shape (7,)."""
+    heading = quat_from_yaw(compute_heading(home[3:]))
+    back = quat_from_yaw(-compute_heading(home[3:]))
+    turn = quat_multiply(quat_multiply(heading, quat_from_rpy(0, pitch, yaw)), back)
+    waist = quat_rotate(heading, WAIST)
+    position = home[:3] + waist - quat_rotate(turn, waist)
+    return make_pose(position, quat_multiply(turn, home[3:]))
+
+
+def _hold_each(home: np.ndarray, heads: tuple[np.ndarray, ...], hold: float) -> GoalTrack:
+    """Stationary goals one after the other, `hold` [s] in all, at least 3 s each."""
+    each = max(3.0, hold / len(heads))
+    steps = tuple(
+        GoalStep(LEAD_IN_S + i * each, head, 0.0, STATIONARY_S) for i, head in enumerate(heads)
+    )
+    return GoalTrack(home, LEAD_IN_S + each * len(heads), steps)
+
+
+def _go(offset: tuple[float, float, float], yaw: float = 0) -> Builder:
+    """One mobile goal, held for `hold` [s] after it should have been reached."""
+
+    def build(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+        del rng, num_goals
+        direct = math.hypot(*offset) / WALK_SPEED
+        step = GoalStep(LEAD_IN_S, move_from(home, offset, yaw), direct, direct + ARRIVAL_S)
+        return GoalTrack(home, step.start + step.limit_s + hold, (step,))
+
+    return build
+
+
+def _squat(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+    del rng, num_goals
+    return _hold_each(home, (move_from(home, (0, 0, -0.15)), home), hold)
+
+
+def _yaw(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+    del rng, num_goals
+    return _hold_each(home, (bend_from(home, yaw=0.5), bend_from(home, yaw=-0.5), home), hold)
+
+
+def _pitch(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+    del rng, num_goals
+    heads = (bend_from(home, pitch=0.2), bend_from(home, pitch=-0.2), home)
+    return _hold_each(home, heads, hold)
+
+
+def make_curve(home: np.ndarray) -> Callable[[float], np.ndarray]:
+    r"""A goal at 0.3 m/s whose heading is :math:`A(1 - \cos(2\pi t/T))`, after the lead-in.
+
+    A is such that the largest turn rate is `CURVE_TURN`; the head faces along the path.
+
+    Args:
+        home: Pose at the start. Shape (7,).
+
+    Returns:
+        The pose at a time [s]. Shape (7,).
+    """
+    omega = 2 * math.pi / CURVE_PERIOD
+    amplitude = CURVE_TURN / omega
+    dt = 0.001
+    times = np.arange(0, CURVE_S + 1, dt)
+    headings = amplitude * (1 - np.cos(omega * times))
+    steps = CURVE_SPEED * dt * np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    places = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])[:-1]
+
+    def path(time: float) -> np.ndarray:
+        since = min(max(0.0, time - LEAD_IN_S), CURVE_S)
+        place = [np.interp(since, times, places[:, i]) for i in range(2)]
+        heading = amplitude * (1 - math.cos(omega * since))
+        return move_from(home, (float(place[0]), float(place[1]), 0.0), heading)
+
+    return path
+
+
+def _curve(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+    del rng, hold, num_goals
+    return GoalTrack(home, LEAD_IN_S + CURVE_S, path=make_curve(home))
+
+
+def _room(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+    """Random places at `WALL_DISTANCE` from a random wall, with a random heading."""
+    del hold
+    steps, start, head = [], LEAD_IN_S, home
+    for _ in range(num_goals):
+        reach = ROOM_HALF - WALL_DISTANCE
+        along = rng.uniform(-reach, reach)
+        wall, heading = rng.integers(4), rng.uniform(-math.pi, math.pi)
+        away = quat_rotate(quat_from_yaw(wall * math.pi / 2), np.array([reach, along, 0.0]))
+        place = np.array([*away[:2], home[2]])
+        level = quat_from_yaw(-compute_heading(home[3:]) + heading)
+        goal = make_pose(place, quat_multiply(level, home[3:]))
+        direct = float(np.linalg.norm(place - head[:3])) / WALK_SPEED
+        steps.append(GoalStep(start, goal, direct, direct + ARRIVAL_S))
+        start, head = start + direct + ARRIVAL_S + ROOM_HOLD_S, goal
+    return GoalTrack(home, start, tuple(steps))
+
+
+def _arms(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+    """Figure 2 of the paper: arms forward and high first, then squat and pitch, then back."""
+    del num_goals
+    reach = np.array([rng.uniform(0.35, 0.45), rng.uniform(0.1, 0.2), rng.uniform(-0.05, 0.1)])
+    down, pitch = rng.uniform(0.15, 0.25), rng.uniform(0.3, 0.5)
+    bent = bend_from(home, pitch=pitch)
+    bent = make_pose(bent[:3] - np.array([0, 0, down]), bent[3:])
+    each = max(4.0, hold / 2)
+    steps = (
+        GoalStep(LEAD_IN_S + 2.0, bent, 0.0, STATIONARY_S),
+        GoalStep(LEAD_IN_S + 2.0 + each, home, 0.0, STATIONARY_S),
+    )
+    return GoalTrack(home, LEAD_IN_S + 2.0 + 2 * each, steps, reach=reach)
+
+
+_STATIONARY = {
+    "squat": ("head 0.15 m down and back", _squat),
+    "yaw": ("waist yaw ±0.5 rad", _yaw),
+    "pitch": ("waist pitch ±0.2 rad", _pitch),
+}
+_MOBILE = {
+    "diagonal": ("0.8 m ahead, 0.3 m aside, 0.4 rad", _go((0.8, 0.3, 0), 0.4)),
+    "ahead": ("2 m ahead", _go((2, 0, 0))),
+    "sideways": ("1 m sideways", _go((0, 1, 0))),
+    "quarter": ("a quarter turn", _go((0, 0, 0), math.pi / 2)),
+    "curve": ("goal at 0.3 m/s on a curve", _curve),
+}
+
+SCENARIOS: dict[str, Scenario] = {
+    **{
+        name: Scenario(name, title, Mode.STATIONARY, build, tolerances=STATIONARY_TOLERANCE)
+        for name, (title, build) in _STATIONARY.items()
+    },
+    **{
+        name: Scenario(name, title, Mode.MOBILE, build, tolerances=MOBILE_TOLERANCE)
+        for name, (title, build) in _MOBILE.items()
+    },
+    "room": Scenario(
+        "room", "goals 0.25 m from walls", Mode.MOBILE, _room, "room", MOBILE_TOLERANCE
+    ),
+    "arms": Scenario(
+        "arms",
+        "arms forward and high, squat and pitch",
+        Mode.STATIONARY,
+        _arms,
+        tolerances=STATIONARY_TOLERANCE,
+    ),
+}
+"""Scenarios by name."""
+
+SCENARIO_GROUPS: dict[str, tuple[str, ...]] = {
+    "stationary": ("squat", "yaw", "pitch"),
+    "mobile": ("diagonal", "ahead", "sideways", "quarter"),
+    "curve": ("curve",),
+    "room": ("room",),
+    "arms": ("arms",),
+}
+"""Scenarios that are told by the same figures, one table each."""
