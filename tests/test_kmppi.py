@@ -86,7 +86,7 @@ def test_samples_are_within_the_bounds(num_knots):
     kmppi = make_kmppi(num_knots=num_knots, num_samples=64)
     kmppi.reset(HIGH)
     samples = kmppi.sample(np.random.default_rng(0), np.full(2, 5.0), np.array([[9.0, -9.0]]))
-    for values in samples:
+    for values in (samples.knots, samples.commands):
         assert (values >= LOW).all()
         assert (values <= HIGH).all()
     assert samples.commands.shape == (64, 10, 2)

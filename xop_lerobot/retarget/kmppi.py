@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
+from xop_lerobot.errors import BadShape
 from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.retarget.optimizer import OPTIMIZERS, Samples, SamplingOptimizer
+from xop_lerobot.retarget.sampling import DRAWS
+from xop_lerobot.retarget.weighting import compute_effective_samples, compute_weights
+
+__all__ = ["Kmppi", "Samples", "compute_effective_samples", "compute_weights"]
+
+_MAX_SHIFTS = 64
 
 
-class Samples(NamedTuple):
-    """Sampled command sequences.
-
-    Attributes:
-        knots: Support values. Shape (K, S, k).
-        commands: Interpolated commands. Shape (K, T, k).
-    """
-
-    knots: np.ndarray
-    commands: np.ndarray
-
-
-class Kmppi:
+@OPTIMIZERS.register("kmppi")
+class Kmppi(SamplingOptimizer):
     r"""Sampling optimizer of a command sequence :math:`A = W\,\theta`.
 
     The sequence of T commands is interpolated from S support values θ by a Gaussian process
@@ -30,122 +25,157 @@ class Kmppi:
     .. math:: A(t) = \theta_S + k(t, t_k)\,k(t_k, t_k)^{-1}(\theta - \theta_S).
 
     A steady command is thus represented exactly, and survives the shift from plan to plan;
-    with the zero mean of the original it would leak towards zero within a few plans.
+    with the zero mean of the original (`kernel_mean="zero"`) it leaks towards zero within a few
+    plans. Samples :math:`\theta + \epsilon` are clipped to the bounds, before and after the
+    interpolation; the plan becomes their weighted mean.
+
+    With `kernel_mean="zero", shift="one", sampling="gaussian", sample_plan=False,
+    weighting="raw", importance_cost=True` and no candidates it does what KMPPI of pytorch_mppi
+    0.9.1 does, to rounding.
 
     Args:
         horizon: Number of control steps T.
         low: Lower bounds. Shape (k,).
         high: Upper bounds. Shape (k,).
-        config: Numbers of samples and knots, kernel, weighting.
+        config: Numbers of samples and knots, kernel, sampling, weighting.
     """
 
     def __init__(self, horizon: int, low: np.ndarray, high: np.ndarray, config: MpcConfig) -> None:
-        self.horizon, self.low, self.high, self.config = horizon, low, high, config
+        super().__init__(horizon, low, high, config)
         num_knots = min(config.num_knots, horizon)
         self.knot_times = np.linspace(0, horizon - 1, num_knots) if num_knots > 1 else np.zeros(1)
-        self.knots = np.zeros((num_knots, len(low)))
+        self.knots = np.zeros((num_knots, len(self.low)))
         self._interpolation = self._compute_interpolation(np.arange(horizon))
+        self._shifts: dict[float, np.ndarray] = {}
+        self._moved: np.ndarray | None = None
+        self._low, self._high = np.tile(self.low, num_knots), np.tile(self.high, num_knots)
+        self._draw = DRAWS[config.sampling]
 
     def _compute_interpolation(self, times: np.ndarray) -> np.ndarray:
         """Matrix W of the interpolation at `times` [control steps]. Shape (T, S)."""
 
         def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-            return np.exp(-((a[:, None] - b) ** 2) / (2 * self.config.kernel_width**2))
+            return np.exp(-((a[:, None] - b) ** 2) / (1e-8 + 2 * self.config.kernel_width**2))
 
         gain = np.linalg.solve(
             kernel(self.knot_times, self.knot_times), kernel(times, self.knot_times).T
         ).T
-        gain[:, -1] += 1 - gain.sum(axis=1)  # the mean: what is left of the last value
+        if self.config.kernel_mean == "hold":
+            gain[:, -1] += 1 - gain.sum(axis=1)  # the mean: what is left of the last value
         return gain
 
     def reset(self, command: np.ndarray) -> None:
         """Plan to hold `command`. Shape (k,)."""
-        self.knots = np.tile(command, (len(self.knot_times), 1))
+        if np.shape(command) != self.low.shape:
+            raise BadShape("command", self.low.shape, np.shape(command))
+        self.knots = np.tile(command, (len(self.knot_times), 1)).astype(float)
+        self._moved = None
+
+    @property
+    def nominal(self) -> np.ndarray:
+        """The planned sequence before the bounds. Shape (T, k)."""
+        return self._interpolation @ self.knots if self._moved is None else self._moved.copy()
 
     @property
     def commands(self) -> np.ndarray:
         """The planned sequence. Shape (T, k)."""
-        return np.clip(self._interpolation @ self.knots, self.low, self.high)
+        return np.clip(self.nominal, self.low, self.high)
 
     def shift(self, steps: float) -> None:
-        """Move the plan on by `steps` control steps; past its end the last value is held."""
-        times = np.minimum(self.knot_times + steps, self.horizon - 1)
-        self.knots = self._compute_interpolation(times) @ self.knots
+        """Move the plan on by `steps` control steps.
+
+        Past its end the last value is held, or, with a kernel of zero mean, fades; until the
+        next update the original then has the old sequence moved on by whole steps, and zeros.
+        """
+        if self.config.shift == "one":
+            steps = 1
+        if self.config.kernel_mean == "zero":
+            whole = min(round(steps), self.horizon)
+            moved = np.zeros((self.horizon, len(self.low)))
+            moved[: self.horizon - whole] = self.nominal[whole:]
+            self._moved = moved
+        self.knots = self._get_shift(steps) @ self.knots
+
+    def _get_shift(self, steps: float) -> np.ndarray:
+        """Matrix that moves the support values on by `steps`. Shape (S, S)."""
+        key = round(min(steps, 1e6), 6)
+        matrix = self._shifts.get(key)
+        if matrix is None:
+            times = self.knot_times + key
+            if self.config.kernel_mean == "hold":
+                times = np.minimum(times, self.horizon - 1)
+            if len(self._shifts) >= _MAX_SHIFTS:  # measured times differ for ever
+                self._shifts.clear()
+            matrix = self._shifts[key] = self._compute_interpolation(times)
+        return matrix
 
     def sample(
         self, rng: np.random.Generator, noise_std: np.ndarray, candidates: np.ndarray
     ) -> Samples:
-        """Draw antithetic samples around the plan; the plan itself and `candidates` come first.
+        """Draw samples around the plan; the plan itself and `candidates` come first.
 
         Args:
             rng: Source of randomness.
-            noise_std: Standard deviation of every entry. Shape (k,).
+            noise_std: Standard deviation of every entry. Shape (k,), or (S, k).
             candidates: Commands to try held over the horizon. Shape (c, k).
 
         Returns:
             K samples within the bounds.
         """
-        fixed = np.concatenate(
-            [self.knots[None], np.repeat(candidates[:, None], len(self.knots), axis=1)]
-        )[: self.config.num_samples]
-        count = self.config.num_samples - len(fixed)
-        half = rng.standard_normal(((count + 1) // 2, *self.knots.shape)) * noise_std
-        noise = np.concatenate([half, -half])[:count]
-        knots = np.clip(np.concatenate([fixed, self.knots + noise]), self.low, self.high)
-        commands = np.clip(self._interpolation @ knots, self.low, self.high)
-        return Samples(knots, commands)
+        total, (num_knots, entries) = self.config.num_samples, self.knots.shape
+        if np.shape(noise_std) not in {(entries,), (num_knots, entries)}:
+            raise BadShape("noise_std", (entries,), np.shape(noise_std))
+        if candidates.ndim != 2 or candidates.shape[1] != entries:
+            raise BadShape("candidates", f"(c, {entries})", candidates.shape)
+        knots = np.empty((total, num_knots, entries))
+        fixed = int(self.config.sample_plan)
+        knots[:fixed] = self.knots
+        candidates = candidates[: total - fixed]
+        knots[fixed : fixed + len(candidates)] = candidates[:, None]
+        fixed += len(candidates)
+        if fixed < total:
+            noise = self._draw(rng, (total - fixed, num_knots, entries))
+            np.multiply(noise, noise_std, out=noise)
+            np.add(noise, self.knots, out=knots[fixed:])
+        rows = knots.reshape(total, -1)
+        np.maximum(rows, self._low, out=rows)
+        np.minimum(rows, self._high, out=rows)
+        commands = self._interpolate(knots)
+        penalty = None
+        if self.config.importance_cost:
+            penalty = self._compute_importance(commands, noise_std)
+        return Samples(knots, commands, penalty)
+
+    def _interpolate(self, knots: np.ndarray) -> np.ndarray:
+        """Command sequences of support values, (K, S, k) -> (K, T, k), as one product."""
+        total, num_knots, entries = knots.shape
+        columns = knots.transpose(1, 0, 2).reshape(num_knots, -1)
+        free = (self._interpolation @ columns).reshape(self.horizon, total, entries)
+        commands = np.empty((total, self.horizon, entries))
+        np.maximum(free.transpose(1, 0, 2), self.low, out=commands)
+        np.minimum(commands, self.high, out=commands)
+        return commands
+
+    def _compute_importance(self, commands: np.ndarray, noise_std: np.ndarray) -> np.ndarray:
+        r"""MPPI's importance sampling: :math:`\lambda\sum_t U_t^\top\Sigma^{-1}(A_t-U_t)`. (K,)."""
+        nominal = self.nominal
+        std = np.broadcast_to(noise_std, self.knots.shape)[0]
+        precision = np.where(std > 0, 1 / np.square(np.where(std > 0, std, 1.0)), 0.0)
+        gain = self.config.temperature * nominal * precision
+        return (commands - nominal).reshape(len(commands), -1) @ gain.ravel()
 
     def update(self, samples: Samples, costs: np.ndarray) -> np.ndarray:
         """Move the plan to the weighted mean of the samples. Returns the weights, shape (K,)."""
-        weights = compute_weights(costs, self.config)
-        used = weights > 0  # a sample that is not finite must not get in with weight 0
-        self.knots = np.tensordot(weights[used], samples.knots[used], axes=1)
+        if np.shape(costs) != (len(samples.knots),):
+            raise BadShape("costs", (len(samples.knots),), np.shape(costs))
+        weights = self._weigh(costs if samples.penalty is None else costs + samples.penalty)
+        mean = weights @ samples.knots.reshape(len(weights), -1)
+        if not np.isfinite(mean).all():  # a sample that is not finite got in with weight 0
+            used = weights > 0
+            mean = weights[used] @ samples.knots[used].reshape(used.sum(), -1)
+        self.knots, self._moved = mean.reshape(self.knots.shape), None
         return weights
 
-
-def compute_weights(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
-    r"""Weights :math:`w_i \propto \exp(-(J_i - \min J)/\lambda)` that sum to one.
-
-    `raw` takes λ in units of the cost; `minmax` divides by the costs' range first; `ess` finds
-    the λ at which the effective sample size :math:`1/\sum w_i^2` is the wanted one, which makes
-    the update independent of the scale of the cost. Samples whose cost is not finite get none.
-
-    Args:
-        costs: Total cost of each sample. Shape (K,).
-        config: Weighting and its parameters.
-
-    Returns:
-        Weights. Shape (K,). All on the first sample (the standing plan) if no cost is finite.
-    """
-    finite = np.isfinite(costs)
-    if not finite.any():
-        weights = np.zeros(len(costs))
-        weights[0] = 1.0
-        return weights
-    excess = np.where(finite, costs - costs[finite].min(), np.inf)
-    span = excess[finite].max()
-    if span <= np.finfo(float).tiny:
-        return finite / finite.sum()
-    if config.weighting == "raw":
-        return _softmin(excess, config.temperature)
-    if config.weighting == "minmax":
-        return _softmin(excess, config.temperature * span)
-    wanted = min(config.effective_samples, 0.99 * finite.sum())
-    low, high = 1e-6 * span, 1e3 * span
-    for _ in range(40):  # bisection on log λ; the effective size grows with λ
-        middle = np.sqrt(low * high)
-        if compute_effective_samples(_softmin(excess, middle)) < wanted:
-            low = middle
-        else:
-            high = middle
-    return _softmin(excess, np.sqrt(low * high))
-
-
-def _softmin(excess: np.ndarray, temperature: float) -> np.ndarray:
-    weights = np.exp(-excess / temperature)
-    return weights / weights.sum()
-
-
-def compute_effective_samples(weights: np.ndarray) -> float:
-    r"""Effective sample size :math:`1/\sum_i w_i^2`, between 1 and K."""
-    return float(1 / np.square(weights).sum())
+    def _weigh(self, costs: np.ndarray) -> np.ndarray:
+        """Weights of samples with total `costs`. Shapes (K,)."""
+        return compute_weights(costs, self.config)
