@@ -1,0 +1,404 @@
+"""`xop-bench`: how long one step of the model predictive controller takes, and on what.
+
+    xop-bench --robot g1 --mode mobile --samples 30 --horizon 3 --threads 2 --json bench.json
+    xop-bench --robot rby1 --mode stationary --profile
+
+A robot follows a moving goal in lock-step, with sensor noise. Every solve of it is timed as a
+whole, state synchronisation and plan; right after it, the same number of physics steps is rolled
+out by one bare call of `mujoco.rollout`, with the same model, start state, controls and number of
+threads, so that whatever slows the machine down slows both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NoReturn
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+
+from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.errors import BadValue, UnknownName, XopError
+from xop_lerobot.evaluation.tracking_report import describe_machine
+from xop_lerobot.evaluation.tracking_scenarios import bend_from, make_curve
+from xop_lerobot.link import RobotInfo
+from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.operator.goal_velocity import GoalVelocity
+from xop_lerobot.plant.config import NOISE_PRESETS, SimulationConfig
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.config import PRESETS, RetargeterConfig
+from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.mpc import MpcRetargeter
+from xop_lerobot.retarget.rollout import PolicyRollout
+from xop_lerobot.retarget.state_sync import StateSync
+from xop_lerobot.state import Goal, RobotState
+from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+from xop_lerobot.transforms import make_pose
+
+KEYS = (
+    "step_ms_median",
+    "step_ms_p99",
+    "rollout_ms_median",
+    "physics_ms_median",
+    "policy_ms_median",
+    "overhead_ratio",
+    "control_hz",
+)
+"""Figures of the JSON file that are a contract."""
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """What is timed.
+
+    Attributes:
+        robot: Name of the robot.
+        mode: Mode of the robot.
+        samples: Rollouts per solve; 0 takes the preset's.
+        horizon: Length of a rollout in control steps of 20 ms; 0 takes the preset's.
+        threads: Threads of the physics; 0 takes one per core.
+        steps: Solves that are timed.
+        warmup: Solves before them.
+        preset: Preset of the retargeter.
+        low_level: Low-level policy; empty for the robot's own.
+        scene: Scene; its fixed boxes are obstacles.
+        noise: Preset of the sensors' noise.
+        seed: Seed of sensors and samples.
+    """
+
+    robot: str
+    mode: Mode
+    samples: int = 0
+    horizon: int = 0
+    threads: int = 0
+    steps: int = 200
+    warmup: int = 20
+    preset: str = "default"
+    low_level: str = ""
+    scene: str = "empty"
+    noise: str = "mild"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, low in (("samples", 0), ("horizon", 0), ("threads", 0), ("steps", 1)):
+            if getattr(self, name) < low:
+                raise BadValue(f"{name} must be at least {low}, got {getattr(self, name)}")
+
+
+class BareRollout:
+    """The lower bound: one call of `mujoco.rollout` for all physics steps of a solve.
+
+    It listens to the policy of a `PolicyRollout` for the controls.
+
+    Args:
+        rollout: The rollout of the planner.
+        num_threads: Threads, as the planner's.
+    """
+
+    def __init__(self, rollout: PolicyRollout, num_threads: int) -> None:
+        self.model, self.substeps = rollout.model, rollout.substeps
+        self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
+        self._data = [mujoco.MjData(self.model) for _ in range(max(num_threads, 1))]
+        self._targets: list[np.ndarray] = []
+        act = rollout.policy.act
+
+        def listen(*arguments: Any, **named: Any) -> Any:
+            output = act(*arguments, **named)
+            self._targets.append(output.targets)
+            return output
+
+        # This instance alone, so that whatever else the planner asks of it is its own.
+        vars(rollout.policy)["act"] = listen
+
+    def forget(self) -> None:
+        """Listen anew, before a solve."""
+        self._targets.clear()
+
+    def run(self, state: RobotState, num_samples: int, horizon: int) -> float:
+        """Roll the controls of the last solve out again, from `state`; return the time [s].
+
+        Raises:
+            BadValue: If the planner did not ask its policy once for each control step.
+        """
+        shapes = [targets.shape for targets in self._targets]
+        if shapes != [(num_samples, self.model.nu)] * horizon:
+            raise BadValue(
+                f"a solve of {num_samples} samples and {horizon} steps must ask the policy "
+                f"{horizon} times for {num_samples} x {self.model.nu} targets, "
+                f"it asked for {shapes}"
+            )
+        model = self.model
+        start = np.zeros((num_samples, 1 + model.nq + model.nv + model.na))
+        start[:, 1 : 1 + model.nq] = state.qpos
+        start[:, 1 + model.nq : 1 + model.nq + model.nv] = state.qvel
+        controls = np.repeat(np.stack(self._targets, axis=1), self.substeps, axis=1)
+        out = np.empty((num_samples, controls.shape[1], start.shape[1]))
+        begin = perf_counter()
+        self._pool.rollout(model, self._data, start, controls, state=out)
+        return perf_counter() - begin
+
+    def close(self) -> None:
+        """Stop the threads."""
+        self._pool.close()
+
+
+def run_bench(config: BenchConfig) -> dict[str, Any]:
+    """Time the solves of a robot that follows a moving goal.
+
+    Returns:
+        The figures of `KEYS`, the settings, the machine, and ``profile``: median time by part.
+
+    Raises:
+        UnknownName: If a name in `config` is unknown.
+    """
+    morphology = make_morphology(config.robot)
+    low_level = config.low_level or morphology.policies[0]
+    settings = RetargeterConfig(
+        num_samples=config.samples,
+        horizon=config.horizon,
+        threads=config.threads,
+        preset=config.preset,
+        seed=config.seed,
+    )
+    info = RobotInfo("bench", morphology, low_level, None, config.scene, 50, config.seed)
+    plant = SimulationConfig(scene=config.scene, noise=config.noise, seed=config.seed)
+    loop = PolicyLoop(morphology, Simulation(morphology, plant), make_policy(low_level))
+    teleoperation = Teleoperation(TeleoperationConfig(retargeter=settings), info)
+    retargeter = teleoperation.retargeter
+    assert isinstance(retargeter, MpcRetargeter)
+    bare = BareRollout(retargeter.rollout, settings.num_threads)
+    try:
+        loop.reset(config.seed)
+        sync = StateSync(morphology, retargeter.rollout.model)
+        rows = _time_solves(config, loop, retargeter, sync, bare)
+    finally:
+        bare.close()
+        teleoperation.disconnect()
+        loop.close()
+    used = retargeter.configs[config.mode]
+    return {
+        **summarise(rows),
+        "robot": config.robot,
+        "mode": config.mode.name.lower(),
+        "samples": used.num_samples,
+        "horizon": used.horizon,
+        "threads": settings.num_threads,
+        "wanted_hz": used.control_hz,
+        "physics_steps": used.num_samples * used.horizon * retargeter.rollout.substeps,
+        "low_level": low_level,
+        "preset": config.preset,
+        "scene": config.scene,
+        "noise": config.noise,
+        "seed": config.seed,
+        "steps": config.steps,
+        "omp_num_threads": os.environ.get("OMP_NUM_THREADS", ""),
+        "machine": describe_machine(),
+    }
+
+
+def _time_solves(
+    config: BenchConfig,
+    loop: PolicyLoop,
+    retargeter: MpcRetargeter,
+    sync: StateSync,
+    bare: BareRollout,
+) -> list[dict[str, float]]:
+    """Solve, roll out bare, and let the robot go on, over and over; times in seconds."""
+    mode, used = config.mode, retargeter.configs[config.mode]
+    period = max(1, round(1 / used.control_hz / POLICY_DT)) * POLICY_DT
+    site = retargeter.morphology.frames["head"]
+    kinematics = SiteKinematics(retargeter.rollout.model, (site,))
+    home = kinematics.compute_poses(loop.state.true_qpos)[site]
+    curve, velocity, begin = make_curve(home), GoalVelocity(), loop.state.time
+    retargeter.reset(loop.state)
+    rows = []
+    for index in range(config.warmup + config.steps):
+        state = loop.state
+        elapsed = state.time - begin
+        head = curve(elapsed) if mode is Mode.MOBILE else _sway(home, elapsed)
+        goals = {"head": head}
+        goal = Goal(goals, velocity.update(state.time, goals), mode)
+        bare.forget()
+        start = perf_counter()
+        synced = sync.synchronise(state.time, state.qpos, state.qvel, mode)
+        state = dataclasses.replace(state, qpos=synced.qpos, qvel=synced.qvel)
+        middle = perf_counter()
+        plan = retargeter.plan(state, goal)
+        end = perf_counter()
+        times = {"step": end - start, "sync": middle - start, **plan.timings}
+        times["bare"] = bare.run(state, used.num_samples, used.horizon)
+        if index >= config.warmup:
+            rows.append(times)
+        loop.execute(RobotAction(plan.command, mode, state.arms), period)
+    return rows
+
+
+def _sway(home: np.ndarray, time: float) -> np.ndarray:
+    """A standing person who bends, turns and squats all the while. Shape (7,)."""
+    pose = bend_from(home, pitch=0.15 * np.sin(1.1 * time), yaw=0.4 * np.sin(0.7 * time))
+    down = 0.06 * (1 - np.cos(0.9 * time))
+    return make_pose(pose[:3] - np.array([0, 0, down]), pose[3:])
+
+
+def summarise(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Figures of timed solves.
+
+    Args:
+        rows: Times by part of every solve [s]; ``step`` is the whole, ``bare`` the bare rollout,
+            ``physics`` and ``policy`` their time within the solve.
+
+    Returns:
+        The figures of `KEYS`; ``control_hz_p99``, ``sync_ms_median``; ``overhead_ratio_p25`` and
+        ``_p75``, quartiles of the ratio within single solves; ``profile`` by part [ms].
+    """
+    parts = {name: np.array([row[name] for row in rows]) * 1000 for name in rows[0]}
+    medians = {name: float(np.median(values)) for name, values in parts.items()}
+    p99 = float(np.percentile(parts["step"], 99))
+    ratios = parts["step"] / parts["bare"]
+    return {
+        "step_ms_median": medians["step"],
+        "step_ms_p99": p99,
+        "rollout_ms_median": medians["bare"],
+        "physics_ms_median": medians["physics"],
+        "policy_ms_median": medians["policy"],
+        "overhead_ratio": medians["step"] / medians["bare"],
+        "control_hz": 1000 / medians["step"],
+        "control_hz_p99": 1000 / p99,
+        "sync_ms_median": medians["sync"],
+        "overhead_ratio_p25": float(np.percentile(ratios, 25)),
+        "overhead_ratio_p75": float(np.percentile(ratios, 75)),
+        "profile": make_profile(medians),
+    }
+
+
+def make_profile(medians: Mapping[str, float]) -> dict[str, float]:
+    """Split the step into parts that add up to it, but for medians not adding up exactly.
+
+    Args:
+        medians: Median time of every part [ms].
+
+    Returns:
+        Time by part [ms]; ``other`` is what no part tells.
+    """
+    profile = {"state sync": medians["sync"], "physics": medians["physics"]}
+    profile["low-level policy"] = medians["policy"]
+    glue = medians.get("rollout", 0.0) - medians["physics"] - medians["policy"]
+    profile["rollout, rest"] = glue
+    known = ("step", "sync", "solve", "bare", "rollout", "physics", "policy")
+    profile |= {name: value for name, value in medians.items() if name not in known}
+    profile["other"] = medians["step"] - sum(profile.values())
+    return profile
+
+
+def print_profile(figures: Mapping[str, Any]) -> None:
+    """Print where the time of a step goes."""
+    whole = figures["step_ms_median"]
+    print(f"\n{'part':<18} {'ms':>8} {'share':>7}")
+    for name, value in figures["profile"].items():
+        print(f"{name:<18} {value:8.2f} {value / whole:7.1%}")
+    print(f"{'step':<18} {whole:8.2f} {1:7.1%}")
+    print(f"{'bare rollout':<18} {figures['rollout_ms_median']:8.2f}")
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are the project's own."""
+
+    def error(self, message: str) -> NoReturn:
+        raise BadValue(message)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
+    parser = _Parser(
+        prog="xop-bench",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    defaults = {each.name: each.default for each in dataclasses.fields(BenchConfig)}
+    add("--robot", required=True, help="g1 or rby1")
+    add("--mode", required=True, help="stationary or mobile")
+    add("--samples", type=int, default=0, help="rollouts per solve; 0: the preset's (default: 0)")
+    add("--horizon", type=int, default=0,
+        help="length of a rollout [steps of 20 ms]; 0: the preset's (default: 0)")  # fmt: skip
+    add("--threads", type=int, default=0, help="threads of the physics; 0: cores (default: 0)")
+    for name, text in (
+        ("steps", "solves that are timed"),
+        ("warmup", "solves before them"),
+        ("seed", "seed of sensors and samples"),
+    ):
+        add(
+            f"--{name}",
+            type=int,
+            default=defaults[name],
+            help=f"{text} (default: {defaults[name]})",
+        )
+    for name, text in (
+        ("preset", f"{', '.join(PRESETS)}"),
+        ("scene", "scene, whose fixed boxes are obstacles"),
+        ("noise", f"sensor noise: {', '.join(NOISE_PRESETS)}"),
+    ):
+        add(f"--{name}", default=defaults[name], help=f"{text} (default: {defaults[name]})")
+    add("--low-level", default="", help="low-level policy (default: the robot's own)")
+    add("--json", type=Path, help="file for the figures; times in ms (default: none)")
+    add("--profile", action="store_true", help="print where the time of a step goes")
+    return parser
+
+
+def parse_arguments(arguments: Sequence[str]) -> tuple[BenchConfig, argparse.Namespace]:
+    """Read the command line.
+
+    Raises:
+        BadValue: If a flag is unknown, absent or malformed; an unknown one lists the known.
+        UnknownName: If a mode or preset is unknown, listing the known ones.
+    """
+    parser = make_parser()
+    args, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        flags = [flag for action in parser._actions for flag in action.option_strings]
+        raise UnknownName("flag of xop-bench", unknown[0], [f for f in flags if f[:2] == "--"])
+    modes = {mode.name.lower(): mode for mode in Mode}
+    if args.mode not in modes:
+        raise UnknownName("mode", args.mode, modes)
+    names = [each.name for each in dataclasses.fields(BenchConfig)]
+    values = {name: getattr(args, name) for name in names}
+    return BenchConfig(**{**values, "mode": modes[args.mode]}), args
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `xop-bench`; returns the exit code."""
+    try:
+        config, args = parse_arguments(sys.argv[1:] if arguments is None else arguments)
+        figures = run_bench(config)
+    except XopError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(
+        f"{figures['robot']} {figures['mode']}, {figures['samples']} samples x "
+        f"{figures['horizon']} steps, {figures['threads']} threads, "
+        f"{figures['steps']} solves, seed {figures['seed']}"
+    )
+    for key in KEYS:
+        print(f"{key:<18} {figures[key]:9.3f}")
+    if args.profile:
+        print_profile(figures)
+    if args.json is not None:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
