@@ -55,9 +55,11 @@ def make_evaluation(seed: int = 0, **fields) -> Evaluation:
         "qpos": qpos,
         "qvel": rng.normal(size=(K, H + 1, NV)),
         "commands": rng.normal(size=(K, H, NA)),
+        "executed": rng.normal(size=NA),
         "reference": rng.normal(size=NA),
         "poses": {name: draw_poses(rng, K, H + 1) for name in ("head", "left_wrist")},
         "points": {site: rng.normal(size=(K, H + 1, 3)) for site in SITES},
+        "velocities": {site: rng.normal(size=(K, H + 1, 3)) for site in SITES},
         "terminal_points": {site: rng.normal(size=(K, 3)) for site in SITES},
         "com": rng.normal(size=(K, H + 1, 3)),
         "terminal_qpos": terminal_qpos,
@@ -151,13 +153,7 @@ def compute_stance_slowly(e: Evaluation, groups: tuple[tuple[str, ...], ...]) ->
         for k in range(1, H + 1):
             speeds, heights = [], []
             for group in groups:
-                squares = [
-                    sum(
-                        ((e.points[s][i, k, j] - e.points[s][i, k - 1, j]) / DT) ** 2
-                        for j in range(3)
-                    )
-                    for s in group
-                ]
+                squares = [sum(e.velocities[s][i, k, j] ** 2 for j in range(3)) for s in group]
                 speeds.append(sum(squares) / len(group))
                 heights.append(sum(e.points[s][i, k, 2] for s in group) / len(group))
             if e.mode is Mode.STATIONARY:
@@ -187,10 +183,10 @@ def test_stance_equals_its_formula(mode, groups):
 def test_in_mobile_mode_the_swinging_foot_is_free():
     still = np.zeros((1, H + 1, 3))
     swinging = still.copy()
-    swinging[0, :, 0] = np.arange(H + 1) * DT  # 1 m/s
-    swinging[..., 2] = 0.05
-    points = {"a": still, "b": swinging}
-    e = make_evaluation(points=points, mode=Mode.MOBILE)
+    swinging[..., 0] = 1.0  # m/s
+    points = {"a": still, "b": still + np.array([0, 0, 0.05])}
+    velocities = {"a": still, "b": swinging}
+    e = make_evaluation(points=points, velocities=velocities, mode=Mode.MOBILE)
     cost = StanceCost((("a",), ("b",)), wheeled=False)
     np.testing.assert_array_equal(cost.compute(e), [0])
     standing = dataclasses.replace(e, mode=Mode.STATIONARY)
@@ -267,13 +263,13 @@ def test_support_equals_its_formula():
     e = make_evaluation()
     expected = []
     for i in range(K):
-        first = (e.com[i, 1, :2] - e.com[i, 0, :2]) / DT
+        first = (e.com[i, 2, :2] - e.com[i, 1, :2]) / DT
         last = (e.com[i, H, :2] - e.com[i, H - 1, :2]) / DT
-        acceleration = (last - first) / ((H - 1) * DT)
+        acceleration = (last - first) / ((H - 2) * DT)
         total = 0.0
-        for k in range(H + 1):
+        for k in range(1, H + 1):
             zmp = e.com[i, k, :2] - e.com[i, k, 2] / g * acceleration
-            total += sum(area.compute_excess(e.qpos[i, k, :7], zmp) ** 2) / (H + 1)
+            total += sum(area.compute_excess(e.qpos[i, k, :7], zmp) ** 2) / H
         total += sum(area.compute_excess(e.terminal_qpos[i, :7], e.terminal_com[i, :2]) ** 2)
         expected.append(WEIGHTS.support * total)
     np.testing.assert_allclose(SupportCost(area).compute(e), expected)
@@ -419,7 +415,7 @@ def test_a_sample_costs_the_same_alone(cost):
         },
         **{
             name: {key: value[2:3] for key, value in getattr(e, name).items()}
-            for name in ("poses", "points", "terminal_points", "terminal_poses")
+            for name in ("poses", "points", "velocities", "terminal_points", "terminal_poses")
         },
     )
     np.testing.assert_allclose(cost.compute(alone), cost.compute(e)[2:3])

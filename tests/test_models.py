@@ -185,7 +185,7 @@ class TestContract:
 
     def test_planning_model_is_bare(self, robot: str) -> None:
         model = model_of(robot, "planning")
-        assert model.ncam == model.nsensor == model.nlight == 0
+        assert model.ncam == model.nlight == 0
         assert not model.dof_frictionloss.any()
         assert model.ngeom <= 9
         _, data = standing(robot, "planning")

@@ -15,11 +15,13 @@ from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.rby1 import RBY1
 from xop_lerobot.morphology.scene import add_block, add_floor, build_model
+from xop_lerobot.morphology.sensing import add_sensing
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
+from xop_lerobot.retarget.intervention import Intervention
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan, Status
@@ -168,6 +170,7 @@ def walled() -> tuple[Morphology, mujoco.MjModel, float]:
     """A robot, its model with a wall 0.9 m ahead of its head, and where the wall is."""
     morphology = GuardedRby1()
     spec = morphology.build_spec("planning")
+    add_sensing(spec, morphology)
     add_floor(spec, seen=False)
     heads = SiteKinematics(spec.compile(), ("head",)).compute_positions(morphology.standing_qpos())
     wall = float(heads["head"][0]) + 0.9
@@ -328,12 +331,15 @@ def test_a_state_that_is_not_finite_is_reported(bench, name):
 
 
 @robots
-def test_a_diverged_plan_holds_the_last_command(bench, name):
+def test_a_diverged_plan_brakes_and_keeps_the_posture(bench, name):
     b = bench(name)
     goal = b.make_goal(Mode.MOBILE, (0.1, 0, 0))
-    last = b.tick(goal).command
-    plan = b.retargeter.plan(spoil(b.loop.state, 0), goal)
-    np.testing.assert_allclose(plan.command, last, atol=1e-9)
+    b.tick(goal)
+    state, velocities = b.loop.state, b.retargeter.command_model.is_velocity()
+    plan = b.retargeter.plan(spoil(state, 0), goal)
+    expected = np.where(velocities[: len(state.command)], 0, state.command)
+    np.testing.assert_allclose(plan.command, expected, atol=1e-9)
+    assert plan.health == {"intervention": Intervention.DIVERGED, "risk": 1.0}
 
 
 # -- settings ------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,12 +12,15 @@ from xop_lerobot.command import Mode
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.costs import SupportArea
+from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
+from xop_lerobot.retarget.heading import linearise_heading
 from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights, _solve_in_box
+from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
 from xop_lerobot.state import Goal, RobotState
 from xop_lerobot.transforms import (
     heading_error,
+    quat_exp,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
@@ -46,9 +50,8 @@ class Parts:
         self.proposal = self.make()
 
     def make(self, **settings) -> KinematicProposal:
-        return KinematicProposal(
-            self.command_model, self.kinematics, {"head": self.head}, **settings
-        )
+        settings.setdefault("base_body", self.morphology.base_body)
+        return KinematicProposal(self.model, self.command_model, {"head": self.head}, **settings)
 
     def reach(self, command: np.ndarray, mode: Mode, dt: float = DT, drift=None) -> np.ndarray:
         """Where the head of an ideal robot is after `dt` of a command."""
@@ -197,7 +200,8 @@ def test_stationary_leaves_the_velocities_neutral(parts, name):
 def test_it_beats_random_commands(parts, name, mode):
     """At goals within reach and beyond it, by its own least squares."""
     p, rng = parts[name], np.random.default_rng(3)
-    scale, effort = p.proposal.scale, p.proposal._effort
+    scale = p.proposal.scale
+    effort = p.proposal.weights.effort * np.array([e.effort for e in p.morphology.effects])
 
     def compute_objective(commands: np.ndarray, goal: np.ndarray) -> np.ndarray:
         future = p.command_model.extrapolate(p.qpos, commands, DT, mode)
@@ -281,31 +285,102 @@ def test_a_dear_entry_is_used_less(parts):
     assert abs(dear[3]) < 0.5 * abs(cheap[3])
 
 
-# -- the box -------------------------------------------------------------------------------
+# -- derivatives -----------------------------------------------------------------------------
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
-def test_without_active_bounds_the_box_is_newtons_step(seed, size):
+@robots
+@modes
+@pytest.mark.parametrize("ramped", [False, True])
+def test_the_command_models_derivative_equals_finite_differences(parts, name, mode, ramped):
+    p, rng = parts[name], np.random.default_rng(4)
+    qpos = p.qpos.copy()
+    qpos[3:7] = quat_exp(np.array([0.1, -0.2, 0.7]))
+    command, drift = p.draw(rng, mode), np.array([0.05, -0.1, 0.2])
+    executed = command + 0.1 * p.space.max_rate * DT * rng.normal(size=len(p.space))
+    arguments = (DT, mode, drift, executed if ramped else None)
+    got = p.command_model.compute_jacobian(qpos, command, *arguments)
+    for i, step in enumerate(1e-6 * np.eye(len(command))):
+        ahead, behind = (
+            p.command_model.extrapolate(qpos, command + sign * step, *arguments) for sign in (1, -1)
+        )
+        tangent = np.empty(p.model.nv)
+        mujoco.mj_differentiatePos(p.model, tangent, 2e-6, behind, ahead)
+        np.testing.assert_allclose(got[:, i], tangent, atol=1e-8)
+
+
+@robots
+@modes
+def test_the_residuals_derivative_equals_finite_differences(parts, name, mode):
+    """With every kind of residual there is, on two frames."""
+    p, rng = parts[name], np.random.default_rng(6)
+    corners = p.morphology.support or ((0.01, -0.01), (0.01, 0.01), (-0.01, 0.01), (-0.01, -0.01))
+    decision = DecisionSpace(p.morphology, p.model)
+    model = CommandModel(p.model, decision.space, decision.effects, p.morphology.pivot)
+    frames = {frame: p.morphology.frames[frame] for frame in ("head", "left_wrist")}
+    proposal = KinematicProposal(
+        p.model,
+        model,
+        frames,
+        ProposalWeights(orientation=(0.3, 0.5, 0.7), lean=3.0, lateral=0.4),
+        SupportArea(corners, free=0.01, margin=0.0),
+        p.morphology.base_body,
+    )
+    qpos = p.qpos.copy()
+    qpos[3:7] = quat_exp(np.array([0.1, -0.2, 0.7]))
+    command = decision.space.neutral + 0.1 * rng.normal(size=len(decision.space))
+    goals = {frame: np.array([0.5, 0.2, 1.1, *quat_exp([0.2, 0.3, 0.5])]) for frame in frames}
+
+    def linearise(command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        wanted = np.array([0.4, 0.3])
+        return proposal.linearise(qpos, command, goals, mode, DT, wanted_velocity=wanted)
+
+    _, got = linearise(command)
+    steps = 1e-6 * np.eye(len(command))
+    numeric = [(linearise(command + s)[0] - linearise(command - s)[0]) / 2e-6 for s in steps]
+    np.testing.assert_allclose(got, np.transpose(numeric), atol=1e-7)
+    assert not np.allclose(got, np.transpose(numeric[::-1]), atol=1e-2)  # a wrong one is caught
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_heading_errors_of_one_orientation_equal_those_of_a_batch(seed):
     rng = np.random.default_rng(seed)
-    root = rng.normal(size=(size, size))
-    matrix, gradient = root @ root.T + np.eye(size), rng.normal(size=size)
-    far = np.full(size, 1e3)
-    step = _solve_in_box(matrix, gradient, -far, far)
-    np.testing.assert_allclose(matrix @ step, -gradient, atol=1e-9)
+    goal, turn = quat_exp(0.8 * rng.normal(size=3)), quat_exp(0.5 * rng.normal(size=3))
+    quat = quat_multiply(turn, goal)
+    error, jacobian = linearise_heading(goal, quat)
+    np.testing.assert_allclose(error, heading_error(goal, quat), atol=1e-9)
+    if abs(quat_rotate(quat, np.array([1.0, 0, 0]))[2]) > 0.99:
+        return  # looking straight up, a frame has no heading
+    steps = 1e-6 * np.eye(3)
+    numeric = [
+        -(
+            heading_error(goal, quat_multiply(quat_exp(step), quat))
+            - heading_error(goal, quat_multiply(quat_exp(-step), quat))
+        )
+        / 2e-6
+        for step in steps
+    ]
+    np.testing.assert_allclose(jacobian, np.transpose(numeric), atol=1e-4)
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
-def test_the_box_holds_and_is_no_worse_than_clipping(seed, size):
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(size, size))
-    matrix, gradient = root @ root.T + 0.1 * np.eye(size), rng.normal(size=size)
-    low, high = -rng.uniform(0, 1, size), rng.uniform(0, 1, size)
-    step = _solve_in_box(matrix, gradient, low, high)
-    assert (step >= low).all()
-    assert (step <= high).all()
-    # It never releases a bound, so it may miss the optimum; where it stands it is stationary.
-    inside = (step > low + 1e-9) & (step < high - 1e-9)
-    np.testing.assert_allclose((matrix @ step + gradient)[inside], 0, atol=1e-8)
+@robots
+@modes
+def test_at_the_solution_no_free_entry_can_do_better(parts, name, mode):
+    """Optimality: the gradient vanishes inside the bounds and points outwards at them."""
+    p, rng = parts[name], np.random.default_rng(8)
+    for share in (0.3, 1.5):  # within reach, and far beyond it
+        goal = p.reach(p.draw(rng, mode, 0.5), mode)
+        goal[:2] += share * rng.uniform(-0.5, 0.5, 2)
+        proposal = p.make(iterations=60)
+        got = proposal.solve(p.qpos, {"head": goal}, mode, DT)
+        residual, jacobian = proposal.linearise(p.qpos, got, {"head": goal}, mode, DT)
+        effort = proposal.weights.effort * np.array([e.effort for e in p.morphology.effects])
+        scaled = (got - p.space.neutral) / proposal.scale
+        gradient = proposal.scale * (jacobian.T @ residual) + effort**2 * scaled
+        acting = p.command_model.acting(mode)
+        at_low, at_high = got <= p.space.low + 1e-9, got >= p.space.high - 1e-9
+        assert (np.abs(gradient[acting & ~at_low & ~at_high]) < 2e-4).all()
+        assert (gradient[acting & at_low] > -2e-4).all()
+        assert (gradient[acting & at_high] < 2e-4).all()
 
 
 # -- the direct baseline -------------------------------------------------------------------

@@ -74,7 +74,7 @@ def predict_slowly(p: Parts, state: RobotState, commands: np.ndarray, mode: Mode
             for _ in range(round(POLICY_DT / model.opt.timestep)):
                 mujoco.mj_step(model, data)
             qpos[i, k + 1], qvel[i, k + 1] = data.qpos, data.qvel
-    return Prediction(qpos, qvel, commands, 0.0, 0.0)
+    return Prediction(qpos, qvel, commands, np.zeros(0), memory, 0.0, 0.0)
 
 
 @robots

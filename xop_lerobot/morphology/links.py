@@ -148,13 +148,12 @@ class Frame:
         return quat_from_matrix(np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=1))
 
 
-def new_spec(name: str, timestep: float, planning: bool) -> mujoco.MjSpec:
+def new_spec(name: str, timestep: float) -> mujoco.MjSpec:
     """Make an empty model with the settings every robot shares.
 
     Args:
         name: Name of the model.
         timestep: Physics step [s].
-        planning: Whether it is a planning model, which gives up what the prediction needs not.
     """
     import mujoco  # noqa: PLC0415
 
@@ -165,8 +164,6 @@ def new_spec(name: str, timestep: float, planning: bool) -> mujoco.MjSpec:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     # Islands pay off with many separate bodies; one robot is faster without.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-    if planning:
-        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     return spec
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from xop_lerobot.morphology.links import FLOOR_BIT, OBJECT_BIT
 from xop_lerobot.morphology.morphology import ModelKind, Morphology
+from xop_lerobot.morphology.sensing import add_sensing
 from xop_lerobot.registry import Registry
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def build_scene_spec(
     """Build a robot in a scene, as an editable model.
 
     The robot comes first in qpos, qvel and among the actuators; the scene's objects follow.
-    The planning model has the floor alone, whatever the scene.
+    The planning model has the floor alone, whatever the scene, and the sensors of `Sensing`.
 
     Args:
         morphology: The robot.
@@ -43,6 +44,8 @@ def build_scene_spec(
     if kind == "full":
         add_sky(spec)
         add_objects(spec)
+    else:
+        add_sensing(spec, morphology)
     return spec
 
 

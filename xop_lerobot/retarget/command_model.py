@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 
 from xop_lerobot.command import CommandSpace, Mode
 from xop_lerobot.morphology.effect import Acts, Effect
-from xop_lerobot.transforms import quat_from_yaw, quat_multiply, quat_yaw
+from xop_lerobot.transforms import (
+    quat_conjugate,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    quat_yaw,
+)
 
 _TWIST = (Acts.FORWARD, Acts.LEFT, Acts.TURN)
+_TURN = 2
 
 
 class CommandModel:
@@ -21,9 +30,12 @@ class CommandModel:
 
     Args:
         model: The robot's model.
-        space: Its command space.
-        effects: One effect for each entry of the command.
+        space: Its command space, or its decision space.
+        effects: One effect for each entry.
         pivot: Forward distance from the base's frame to its centre of turning [m].
+
+    Attributes:
+        body: Which entries are free to act; all at first. Shape (k,), bool.
     """
 
     def __init__(
@@ -34,14 +46,28 @@ class CommandModel:
         pivot: float = 0.0,
     ) -> None:
         self.space, self.effects, self.pivot = space, effects, pivot
-        self._address = [
-            int(model.joint(effect.joint).qposadr[0]) if effect.joint else 2 for effect in effects
+        self.body = np.ones(len(space), dtype=bool)
+        self._nv = model.nv
+        self._twist = [
+            (i, _TWIST.index(effect.acts))
+            for i, effect in enumerate(effects)
+            if effect.acts in _TWIST
         ]
+        self._is_velocity = np.array([effect.acts in _TWIST for effect in effects])
+        self._follows = ~self._is_velocity
+        joints = [model.joint(e.joint) if e.joint else None for e in effects]
+        self._address = np.array([int(joint.qposadr[0]) if joint else 2 for joint in joints])
+        self._dof = np.array([int(joint.dofadr[0]) if joint else 2 for joint in joints])
+        self._lag = np.array([effect.lag_s for effect in effects])
+        self._modes = {
+            mode: np.array([mode in effect.modes for effect in effects])
+            & ~(space.mobile_only & (mode == Mode.STATIONARY))
+            for mode in Mode
+        }
 
     def acting(self, mode: Mode) -> np.ndarray:
-        """Which entries have an effect in `mode`. Shape (k,), bool."""
-        acts = np.array([mode in effect.modes for effect in self.effects])
-        return acts & ~(self.space.mobile_only & (mode == Mode.STATIONARY))
+        """Which free entries have an effect in `mode`. Shape (k,), bool."""
+        return self._modes[mode] & self.body
 
     @property
     def is_nonholonomic(self) -> bool:
@@ -51,24 +77,30 @@ class CommandModel:
 
     def is_velocity(self) -> np.ndarray:
         """Which entries are velocities of the base. Shape (k,), bool."""
-        return np.array([effect.acts in _TWIST for effect in self.effects])
+        return self._is_velocity
 
     def compute_twist(self, command: np.ndarray) -> np.ndarray:
         """Commanded base velocity: along, across [m/s], yaw rate [rad/s]. (..., k) -> (..., 3)."""
         twist = np.zeros((*command.shape[:-1], 3))
-        for i, effect in enumerate(self.effects):
-            if effect.acts in _TWIST:
-                twist[..., _TWIST.index(effect.acts)] += command[..., i]
+        for i, axis in self._twist:
+            twist[..., axis] += command[..., i]
         return twist
 
-    def _ramp(self, command: np.ndarray, executed: np.ndarray, dt: float) -> np.ndarray:
-        """What the rate limits make of a command: its mean for velocities, its end for the rest."""
-        rate = self.space.max_rate
-        wanted = command - executed
-        reached = executed + np.clip(wanted, -rate * dt, rate * dt)
-        ramp = np.minimum(np.abs(wanted) / rate, dt) / dt  # share of the time spent on the ramp
-        mean = reached - (reached - executed) * ramp / 2
-        return np.where(self.is_velocity(), mean, reached)
+    def _ramp(
+        self, command: np.ndarray, executed: np.ndarray, dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What the rate limits make of a command: its mean for velocities, its end for the rest.
+
+        Returns:
+            The effective command and its derivative by the command. Shapes (..., k).
+        """
+        reach = self.space.max_rate * dt
+        reached = np.clip(command - executed, -reach, reach)
+        ramp = np.abs(reached) / reach  # share of the time spent on the ramp
+        mean = reached * (1 - ramp / 2)
+        inside = np.abs(command - executed) <= reach
+        slope = np.where(self._is_velocity, 1 - ramp, 1.0) * inside
+        return executed + np.where(self._is_velocity, mean, reached), slope
 
     def extrapolate(
         self,
@@ -95,17 +127,16 @@ class CommandModel:
         """
         shape = np.broadcast_shapes(qpos.shape[:-1], command.shape[:-1])
         if executed is not None:
-            command = self._ramp(command, executed, dt)
+            command, _ = self._ramp(command, executed, dt)
         result = np.broadcast_to(qpos, (*shape, qpos.shape[-1])).copy()
-        for i, (effect, acts) in enumerate(zip(self.effects, self.acting(mode), strict=True)):
-            if acts and effect.acts not in _TWIST:
-                share = 1 - np.exp(-dt / effect.lag_s)
-                address = self._address[i]
-                result[..., address] += share * (command[..., i] - result[..., address])
-        if not (self.acting(mode) & self.is_velocity()).any():
+        acting = self.acting(mode)
+        index = np.flatnonzero(acting & self._follows)
+        share, address = 1 - np.exp(-dt / self._lag[index]), self._address[index]
+        result[..., address] += share * (command[..., index] - result[..., address])
+        if not (acting & self._is_velocity).any():
             return result
         twist = self.compute_twist(command) + (0 if drift is None else drift)
-        forward, left, turn = np.moveaxis(np.broadcast_to(twist, (*shape, 3)), -1, 0)
+        forward, left, turn = twist[..., 0], twist[..., 1], twist[..., 2]
         yaw = quat_yaw(result[..., 3:7])
         middle = yaw + turn * dt / 2  # heading halfway: the chord of the arc
         x, y = np.cos(middle), np.sin(middle)
@@ -116,3 +147,49 @@ class CommandModel:
             result[..., 1] += self.pivot * (np.sin(yaw) - np.sin(yaw + turn * dt))
         result[..., 3:7] = quat_multiply(quat_from_yaw(turn * dt), result[..., 3:7])
         return result
+
+    def compute_jacobian(
+        self,
+        qpos: np.ndarray,
+        command: np.ndarray,
+        dt: float,
+        mode: Mode,
+        drift: np.ndarray | None = None,
+        executed: np.ndarray | None = None,
+    ) -> np.ndarray:
+        r"""Compute :math:`\partial\phi_\tau(q, a)/\partial a`, in MuJoCo's tangent space.
+
+        Linear velocity of the base in the world, its angular velocity in the body at the
+        extrapolated configuration. Arguments as for `extrapolate`, without leading dimensions.
+
+        Returns:
+            Derivative. Shape (nv, k); zero for entries that do not act.
+        """
+        slope = np.ones(len(command))
+        if executed is not None:
+            command, slope = self._ramp(command, executed, dt)
+        acting = self.acting(mode)
+        jacobian = np.zeros((self._nv, len(command)))
+        index = np.flatnonzero(acting & self._follows)
+        jacobian[self._dof[index], index] = (1 - np.exp(-dt / self._lag[index])) * slope[index]
+        if not (acting & self._is_velocity).any():
+            return jacobian
+        twist = self.compute_twist(command) + (0 if drift is None else drift)
+        forward, left, turn = (float(value) for value in twist)
+        yaw = float(quat_yaw(qpos[3:7]))
+        middle, end = yaw + turn * dt / 2, yaw + turn * dt
+        x, y = math.cos(middle), math.sin(middle)
+        across = dt * dt / 2
+        turning = (
+            -across * (forward * y + left * x) + self.pivot * dt * math.sin(end),
+            across * (forward * x - left * y) - self.pivot * dt * math.cos(end),
+        )
+        columns = ((dt * x, dt * y), (-dt * y, dt * x), turning)
+        # A turn about the vertical, seen from the body: R^T e_z, which the turn leaves alone.
+        axis = dt * quat_rotate(quat_conjugate(qpos[3:7]), np.array([0.0, 0, 1]))
+        for i, acts in self._twist:
+            if acting[i]:
+                jacobian[:2, i] = np.multiply(columns[acts], slope[i])
+                if acts == _TURN:
+                    jacobian[3:6, i] = axis * slope[i]
+        return jacobian

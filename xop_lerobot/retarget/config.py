@@ -150,8 +150,10 @@ class MpcConfig:
             if getattr(self, name) != int(getattr(self, name)):
                 raise BadValue(f"{name} must be a whole number, got {getattr(self, name)}")
         positive = ("kernel_width", "temperature", "full_noise_error", "control_hz")
-        for name in (*positive, "proposal_s", "reach"):
+        for name in (*positive, "proposal_s"):
             _check_positive(name, getattr(self, name))
+        if not self.reach > 0:  # may be infinite
+            raise BadValue(f"reach must be positive, got {self.reach}")
         for name in ("preview_s", "extrapolation_s", "min_noise"):
             _check_range(name, getattr(self, name), 0)
         for name, value in self.noise_std.items():

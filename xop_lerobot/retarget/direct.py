@@ -11,7 +11,6 @@ from xop_lerobot.command import Mode
 from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Plan, Retargeter
 from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
 from xop_lerobot.state import Goal, RobotState
@@ -39,10 +38,7 @@ class DirectRetargeter(Retargeter):
         self.command_model = CommandModel(model, self.space, morphology.effects, morphology.pivot)
         site = morphology.frames["head"]
         self.proposal = KinematicProposal(
-            self.command_model,
-            SiteKinematics(model, (site,)),
-            {"head": site},
-            ProposalWeights(position=(0.0, 0.0, 1.0)),
+            model, self.command_model, {"head": site}, ProposalWeights(position=(0.0, 0.0, 1.0))
         )
         self._last = self.space.neutral
 

@@ -2,40 +2,36 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from threading import RLock
 from time import perf_counter
 
 import mujoco
 import numpy as np
 
 from xop_lerobot.command import Mode
+from xop_lerobot.errors import UnknownName
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
-from xop_lerobot.retarget.costs import (
-    CollisionCost,
-    ControlCost,
-    Cost,
-    Evaluation,
-    FallCost,
-    LateralCost,
-    StanceCost,
-    SupportArea,
-    SupportCost,
-    TerminalCost,
-    TrackingCost,
-)
-from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
+from xop_lerobot.retarget.config import CONSTRAINTS, MpcConfig, RetargeterConfig, split_names
+from xop_lerobot.retarget.costs import CollisionCost, FallCost, SupportArea, make_costs
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.retarget.decision import DecisionSpace
+from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.drift import DriftObserver
-from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.retarget.kmppi import Kmppi, Samples, compute_effective_samples
+from xop_lerobot.retarget.horizon_goals import hold_near, preview
+from xop_lerobot.retarget.intervention import Verdict, judge
+from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
+from xop_lerobot.retarget.optimizer import SamplingOptimizer, build_optimizer
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
 from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
+from xop_lerobot.retarget.readings import Readings
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
+from xop_lerobot.retarget.weighting import compute_effective_samples
 from xop_lerobot.state import Goal, RobotState
-from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply, rotation_error
+from xop_lerobot.transforms import rotation_error
 
 _SLOW = 0.3  # speed up to which a base on wheels need not face where it goes [m/s]
 
@@ -43,17 +39,17 @@ _SLOW = 0.3  # speed up to which a base on wheels need not face where it goes [m
 class MpcRetargeter(Retargeter):
     r"""Solves Eq. 1: :math:`\min_{a_0 \dots a_{H-1}} \sum_k l(x_k, a_k, G) + V_f(x_H, G)`.
 
-    Each solve shifts the last plan by the time that has passed, adds three fixed candidates (the
-    kinematic proposal, the command being executed, the neutral command) to antithetic samples
-    around it, rolls all out in MuJoCo with the low-level policy and its memory in the loop, and
-    moves the plan to the weighted mean.
+    Each solve shifts the last plan by the time that has passed, adds fixed candidates (the
+    kinematic proposal, the command being executed, a stop) to samples around it, rolls all out
+    in MuJoCo with the low-level policy and its memory in the loop, and moves the plan to the
+    weighted mean. `configure` changes settings between two solves, from any thread.
 
     Args:
         morphology: The robot.
         policy: Its low-level policy.
         model: Its planning model in the scene.
         config: Settings; zeros take the robot's own parameters.
-        frames: Tracked frames that the commands shall follow.
+        targets: Tracked frames to follow; None takes those of `config`.
         obstacles: What to keep clear of; by default what is fixed in `model`.
     """
 
@@ -63,67 +59,120 @@ class MpcRetargeter(Retargeter):
         policy: LowLevelPolicy,
         model: mujoco.MjModel,
         config: RetargeterConfig | None = None,
-        frames: tuple[str, ...] = ("head",),
-        obstacles: tuple[Obstacle, ...] | None = None,
+        targets: tuple[str, ...] | None = None,
+        obstacles: Iterable[Obstacle] | None = None,
     ) -> None:
         config = config or RetargeterConfig()
-        self.morphology, self.frames = morphology, frames
-        self.space = morphology.command_space
-        self.configs = {mode: _override(morphology.mpc_config(mode), config) for mode in Mode}
+        self.morphology = morphology
+        self.decision = DecisionSpace(morphology, model)
+        self.space = self.decision.space
         self.rollout = PolicyRollout(model, policy, config.num_threads)
-        self.command_model = CommandModel(model, self.space, morphology.effects, morphology.pivot)
-        self.sites = {name: morphology.frames[name] for name in frames}
-        obstacles = make_obstacles(model) if obstacles is None else obstacles
-        hull = morphology.hull_points if obstacles else {}
-        self._hull = tuple(hull)
-        self._points = tuple(dict.fromkeys((*morphology.contact_points, *hull)))
-        self.kinematics = SiteKinematics(
-            model,
-            (*self.sites.values(), *self._points),
-            com_of=morphology.base_body if morphology.support else None,
+        self.command_model = CommandModel(
+            model, self.space, self.decision.effects, morphology.pivot
         )
+        self.drift = DriftObserver(self.command_model)
+        hull = morphology.hull_points
+        self._collision = CollisionCost(
+            make_obstacles(model) if obstacles is None else obstacles, hull
+        )
+        self.readings = Readings(morphology, model, hull if self._collision.obstacles else {})
         self.support = None
         if morphology.support:
-            resting = self.kinematics.compute_com(morphology.standing_qpos())
+            resting = self.readings.compute_com(morphology.standing_qpos())
             self.support = SupportArea(morphology.support, tuple(resting[:2]))
-        self.proposals = {
-            mode: KinematicProposal(
-                self.command_model,
-                self.kinematics,
-                self.sites,
-                make_proposal_weights(each.weights),
-                self.support,
-            )
-            for mode, each in self.configs.items()
-        }
-        standing_height = float(morphology.standing_qpos()[2])
-        self.costs: tuple[Cost, ...] = (
-            TrackingCost(),
-            TerminalCost(),
-            StanceCost(morphology.contact_groups, morphology.wheeled),
-            CollisionCost(obstacles, hull),
-            ControlCost((self.space.high - self.space.low) / 2),
-            SupportCost(self.support),
-            LateralCost(self.command_model.is_nonholonomic),
-            FallCost(morphology.fall_tilt, morphology.fall_height, standing_height),
+        height = float(morphology.standing_qpos()[2])
+        self._fall = FallCost(morphology.fall_tilt, morphology.fall_height, height)
+        self.costs: tuple[Cost, ...] = make_costs(
+            morphology, self.command_model, self.support, self._collision, self._fall
         )
         self.cost_names = tuple(cost.name for cost in self.costs)
+        self._direct: DirectRetargeter | None = None
         self._rng = np.random.default_rng(config.seed)
         self._seed = config.seed
-        self._planners = {
-            mode: Kmppi(self.configs[mode].horizon, self.space.low, self.space.high, each)
-            for mode, each in self.configs.items()
-        }
-        for each in self.configs.values():
-            for name in each.noise_std:
-                self.space.index(name)  # a misspelt name must not mean no noise
-        self._noise = {
-            mode: np.array([each.noise_std.get(name, 0.0) for name in self.space.names])
-            * self.command_model.acting(mode)
-            for mode, each in self.configs.items()
-        }
-        self.drift = DriftObserver(self.command_model)
+        self._lock = RLock()
         self._last: tuple[float, Mode] | None = None
+        self.configs: dict[Mode, MpcConfig] = {}
+        self.proposals: dict[Mode, KinematicProposal] = {}
+        self._planners: dict[Mode, SamplingOptimizer] = {}
+        self._noise: dict[Mode, np.ndarray] = {}
+        if targets is None:
+            targets = split_names(config.targets) or ("head",)
+        self.configure(
+            {mode: _override(morphology.mpc_config(mode), config) for mode in Mode},
+            targets,
+            split_names(config.body),
+            frozenset(split_names(config.constraints)),
+        )
+
+    def configure(
+        self,
+        configs: Mapping[Mode, MpcConfig] | None = None,
+        targets: tuple[str, ...] | None = None,
+        body: tuple[str, ...] | None = None,
+        constraints: frozenset[str] | None = None,
+    ) -> None:
+        """Change settings from the next solve on; None leaves them. All or nothing.
+
+        The plan goes on: other weights or samples move it, and the rate limits hold.
+
+        Args:
+            configs: Parameters of the modes that change.
+            targets: Tracked frames to follow.
+            body: Commands and arm joints that may be moved for them; empty: all commands.
+            constraints: Constraints that hold, such as ``"upright"``.
+
+        Raises:
+            UnknownName: If a target, an entry or a constraint is not known; lists those that are.
+        """
+        with self._lock:
+            new = {**self.configs, **(configs or {})}
+            frames = self.morphology.frames
+            for name in targets or ():
+                if name not in frames:
+                    raise UnknownName("tracked frame", name, frames)
+            for name in constraints or ():
+                if name not in CONSTRAINTS:
+                    raise UnknownName("constraint", name, CONSTRAINTS)
+            mask = self.command_model.body if body is None else self.decision.make_mask(body)
+            noise = {mode: self._make_noise(each) for mode, each in new.items()}
+            planners = {mode: self._renew(mode, each) for mode, each in new.items()}
+
+            self.configs, self._noise, self._planners = new, noise, planners
+            if targets is not None:
+                self.frames = targets
+                self.sites = {name: frames[name] for name in targets}
+            if body is not None and not np.array_equal(mask, self.command_model.body):
+                self.command_model.body, self._last = mask, None
+            if constraints is not None:
+                self.constraints = constraints
+            self.proposals = {
+                mode: KinematicProposal(
+                    self.rollout.model,
+                    self.command_model,
+                    self.sites,
+                    make_proposal_weights(each.weights),
+                    self.support,
+                    self.morphology.base_body,
+                )
+                for mode, each in new.items()
+            }
+
+    def _make_noise(self, config: MpcConfig) -> np.ndarray:
+        """Standard deviation of every entry; a misspelt name must not mean no noise. (n,)."""
+        noise = np.zeros(len(self.space))
+        for name, value in config.noise_std.items():
+            noise[self.space.index(name)] = value
+        return noise
+
+    def _renew(self, mode: Mode, config: MpcConfig) -> SamplingOptimizer:
+        """The optimizer for a configuration: the present one, or one that holds its command."""
+        old = self.configs.get(mode)
+        if old is not None and replace(old, weights=config.weights) == config:
+            return self._planners[mode]
+        planner = build_optimizer(config.horizon, self.space.low, self.space.high, config)
+        if old is not None:
+            planner.reset(self._planners[mode].commands[0])
+        return planner
 
     def control_period(self, mode: Mode) -> float:
         """Time between two plans in `mode` [s]."""
@@ -135,65 +184,72 @@ class MpcRetargeter(Retargeter):
 
     def reset(self, state: RobotState) -> None:
         """Start anew from the command that `state` executes, with the seed's first samples."""
-        self._rng = np.random.default_rng(self._seed)
-        self._last = None
-        self.drift.reset()
-        for planner in self._planners.values():
-            planner.reset(state.command)
+        with self._lock:
+            self._rng = np.random.default_rng(self._seed)
+            self._last = None
+            self.drift.reset()
+            for planner in self._planners.values():
+                planner.reset(self.decision.join(state.command, state.arms))
 
     def plan(self, state: RobotState, goal: Goal) -> Plan:
         """Compute the plan from `state` towards `goal`."""
+        with self._lock:
+            return self._solve(state, goal)
+
+    def _solve(self, state: RobotState, goal: Goal) -> Plan:
         start = perf_counter()
         mode, config, planner = goal.mode, self.configs[goal.mode], self._planners[goal.mode]
-        self._warm_start(state, mode)
-        self.drift.update(state.time, state.qpos, state.command, mode is Mode.MOBILE)
-        goal = self._hold_near(state, goal, config.reach)
-        ahead = np.arange(config.horizon + 1) * POLICY_DT
-        goals = self._preview(goal, ahead, config)
-        then = self._preview(goal, np.array([config.proposal_s]), config)
-        wanted = self._compute_wanted_velocity(state, then, config)
-        proposal = self.proposals[mode].solve(
-            state.qpos,
-            {name: poses[0] for name, poses in then.items()},
-            mode,
-            config.proposal_s,
-            start=planner.commands[0],
-            drift=self.drift.drift,
-            executed=state.command,
-            wanted_velocity=wanted,
-        )
-        if not np.isfinite(proposal).all():
-            proposal = state.command
-        candidates = np.stack([proposal, state.command, self.space.neutral])
+        executed = self.decision.join(state.command, state.arms)
         acting = self.command_model.acting(mode)
-        candidates = np.where(acting, candidates, self.space.neutral)
-        noise = self._noise[mode] * self._noise_share(state, goals, config)
+        held = self._compute_held(executed, mode)
+        self._warm_start(np.where(acting, executed, held), state.time, mode)
+        if config.observe_drift:
+            self.drift.update(state.time, state.qpos, executed, mode is Mode.MOBILE)
+        drift = self.drift.drift if config.observe_drift else np.zeros(3)
+        poses = self.readings.compute_poses(state.qpos, self.sites)
+        goal = hold_near(goal, poses, config.reach)
+        wanted = self._compute_wanted_velocity(poses, goal, config)
+        proposal = self._propose(state, goal, executed, held, drift, wanted, config)
+        candidates = self._collect_candidates(state, goal, executed, proposal, config)
+        candidates = np.where(acting, candidates, held)
+        noise = self._noise[mode] * acting * self._compute_noise_share(poses, goal, config)
         samples = planner.sample(self._rng, noise, candidates)
+        commands = np.where(acting, samples.commands, held)
         sampled = perf_counter()
 
-        prediction = self.rollout.predict(
-            state.qpos,
-            state.qvel,
-            state.memory,
-            self._limit_rates(state.command, samples.commands),
-            state.arms,
-            mode,
-        )
+        prediction = self._predict(state, self._limit_rates(executed, commands), mode)
         rolled = perf_counter()
         with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
-            terms = self._evaluate(prediction, samples, goals, goal, proposal, wanted, config)
+            evaluation = self._evaluate(
+                prediction, commands, goal, executed, proposal, wanted, drift, config
+            )
+            terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
         costs = np.sum(list(terms.values()), axis=0)
+        if samples.penalty is not None:
+            costs = costs + samples.penalty
         weights = planner.update(samples, costs)
+        stop = config.sample_plan + (
+            config.candidates.index("stop") if "stop" in config.candidates else 0
+        )
+        falls = self._fall.find_falls(evaluation) | ~np.isfinite(costs)
+        touches = self._collision.find_touches(evaluation)
+        verdict = judge(weights, costs, falls, touches, min(stop, len(costs) - 1))
+        planned = self._apply(verdict, planner, samples.commands, executed)
+        planned = np.where(acting, planned, held)
         best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
         end = perf_counter()
 
         self._last = (state.time, mode)
+        count = self.decision.num_commands
+        names = self.space.names
         return Plan(
-            command=planner.commands[0],
-            commands=planner.commands,
+            command=planned[0, :count],
+            commands=planned[:, :count],
             mode=mode,
             qpos=prediction.qpos[best],
+            arms={names[i]: planned[:, i] for i in np.flatnonzero(acting) if i >= count},
             cost={name: float(np.nan_to_num(term[best])) for name, term in terms.items()},
+            health={"intervention": float(verdict.intervention), "risk": verdict.risk},
             status=Status.OK if np.isfinite(costs).any() else Status.DIVERGED,
             effective_samples=compute_effective_samples(weights),
             timings={
@@ -206,133 +262,202 @@ class MpcRetargeter(Retargeter):
             },
         )
 
-    def _warm_start(self, state: RobotState, mode: Mode) -> None:
+    def _compute_held(self, executed: np.ndarray, mode: Mode) -> np.ndarray:
+        """What entries do that are not decided: nothing; the rest of the body stays. (n,)."""
+        stays = ~self.command_model.body & ~self.command_model.is_velocity()
+        return np.where(stays, executed, self.space.neutral)
+
+    def _warm_start(self, executed: np.ndarray, time: float, mode: Mode) -> None:
         """Shift the last plan by the time that has passed, or start from the executed command."""
         planner = self._planners[mode]
         if self._last is None or self._last[1] is not mode:
-            acting = self.command_model.acting(mode)
-            planner.reset(np.where(acting, state.command, self.space.neutral))
+            planner.reset(executed)
         else:
-            planner.shift(max(0.0, state.time - self._last[0]) / POLICY_DT)
-
-    def _hold_near(self, state: RobotState, goal: Goal, reach: float) -> Goal:
-        """Move goals that are further than `reach` [m] aside of their frame up to that distance."""
-        poses = self.kinematics.compute_poses(state.qpos, tuple(self.sites.values()))
-        near = dict(goal.poses)
-        for name in self.frames:
-            if name in near:
-                position = poses[self.sites[name]][:3]
-                offset = near[name][:3] - position
-                share = min(1.0, reach / max(float(np.linalg.norm(offset[:2])), 1e-9))
-                held = position + np.array([share, share, 1.0]) * offset
-                near[name] = make_pose(held, near[name][3:])
-        return dataclasses.replace(goal, poses=near)
-
-    def _preview(self, goal: Goal, ahead: np.ndarray, config: MpcConfig) -> dict[str, np.ndarray]:
-        """Goals `ahead` seconds from now, at constant velocity up to `preview_s`."""
-        times = np.minimum(ahead, config.preview_s)[:, None]
-        goals = {}
-        for name in self.frames:
-            if name not in goal.poses:
-                continue
-            pose, velocity = goal.poses[name], goal.velocities.get(name, np.zeros(6))
-            position = pose[:3] + times * velocity[:3]
-            quat = quat_multiply(quat_exp(times * velocity[3:]), pose[3:])
-            goals[name] = make_pose(position, quat)
-        return goals
-
-    def _limit_rates(self, executed: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """What the robot will make of command sequences. Shapes (k,), (K, H, k)."""
-        step = self.space.max_rate * POLICY_DT
-        limited = np.empty_like(commands)
-        for k in range(commands.shape[1]):
-            executed = np.clip(commands[:, k], executed - step, executed + step)
-            limited[:, k] = executed
-        return limited
+            planner.shift(max(0.0, time - self._last[0]) / POLICY_DT)
 
     def _compute_wanted_velocity(
-        self, state: RobotState, then: Mapping[str, np.ndarray], config: MpcConfig
+        self, poses: Mapping[str, np.ndarray], goal: Goal, config: MpcConfig
     ) -> np.ndarray:
-        """Velocity that takes the first tracked frame to its goal in time, less a slow one.
+        """Velocity that takes the first target to its goal in time, less a slow one. Shape (2,).
 
         At rest the base need not face the last centimetres: they are turned into, not driven.
-
-        Returns:
-            Velocity in the world [m/s]. Shape (2,).
         """
-        for name, poses in then.items():
-            site = self.sites[name]
-            here = self.kinematics.compute_positions(state.qpos, (site,))[site]
-            velocity = (poses[0, :2] - here[:2]) / config.proposal_s
+        for name, poses_then in self._preview(goal, config.proposal_s, config).items():
+            velocity = (poses_then[0, :2] - poses[name][:2]) / config.proposal_s
             speed = float(np.linalg.norm(velocity))
             return velocity * max(0.0, 1 - _SLOW / max(speed, 1e-9))
         return np.zeros(2)
 
-    def _noise_share(
-        self, state: RobotState, goals: Mapping[str, np.ndarray], config: MpcConfig
+    def _preview(
+        self, goal: Goal, ahead: float | np.ndarray, config: MpcConfig
+    ) -> dict[str, np.ndarray]:
+        return preview(goal, self.frames, np.atleast_1d(ahead), config.preview_s)
+
+    def _propose(
+        self,
+        state: RobotState,
+        goal: Goal,
+        executed: np.ndarray,
+        held: np.ndarray,
+        drift: np.ndarray,
+        wanted: np.ndarray,
+        config: MpcConfig,
+    ) -> np.ndarray:
+        """The kinematic proposal, or the executed command where there is none. Shape (n,)."""
+        if "proposal" not in config.candidates and config.control_reference != "proposal":
+            return executed
+        then = self._preview(goal, config.proposal_s, config)
+        proposal = self.proposals[goal.mode].solve(
+            state.qpos,
+            {name: poses[0] for name, poses in then.items()},
+            goal.mode,
+            config.proposal_s,
+            start=self._planners[goal.mode].commands[0],
+            drift=drift,
+            executed=executed,
+            wanted_velocity=wanted,
+        )
+        if not np.isfinite(proposal).all():
+            return executed
+        return np.where(self.command_model.acting(goal.mode), proposal, held)
+
+    def _collect_candidates(
+        self,
+        state: RobotState,
+        goal: Goal,
+        executed: np.ndarray,
+        proposal: np.ndarray,
+        config: MpcConfig,
+    ) -> np.ndarray:
+        """The fixed commands to try. Shape (c, n)."""
+        candidates = []
+        for name in config.candidates:
+            if name == "proposal":
+                candidates.append(proposal)
+            elif name == "direct":
+                command = self._map_directly(state, goal)
+                candidates.append(self.decision.join(command, state.arms))
+            elif name == "previous":
+                candidates.append(executed)
+            else:
+                candidates.append(np.where(self.command_model.is_velocity(), 0.0, executed))
+        return np.array(candidates).reshape(-1, len(self.space))
+
+    def _map_directly(self, state: RobotState, goal: Goal) -> np.ndarray:
+        if self._direct is None:
+            self._direct = DirectRetargeter(self.morphology, self.rollout.model)
+            self._direct.reset(state)
+        return self._direct.plan(state, goal).command
+
+    def _compute_noise_share(
+        self, poses: Mapping[str, np.ndarray], goal: Goal, config: MpcConfig
     ) -> float:
         """Share of the full noise: little at the goal, where fine commands are what counts."""
-        poses = self.kinematics.compute_poses(state.qpos, tuple(self.sites.values()))
         error = 0.0
-        for name, goal in goals.items():
-            pose = poses[self.sites[name]]
-            turn = np.linalg.norm(rotation_error(goal[-1, 3:], pose[3:]))
-            error = max(error, np.linalg.norm(pose[:3] - goal[-1, :3]), 0.5 * turn)
+        ahead = config.horizon * POLICY_DT
+        for name, goals in self._preview(goal, ahead, config).items():
+            turn = np.linalg.norm(rotation_error(goals[0, 3:], poses[name][3:]))
+            error = max(error, np.linalg.norm(poses[name][:3] - goals[0, :3]), 0.5 * turn)
         return float(np.clip(error / config.full_noise_error, config.min_noise, 1.0))
+
+    def _limit_rates(self, executed: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """What the robot will make of command sequences. Shapes (n,), (K, H, n)."""
+        step = self.space.max_rate * POLICY_DT
+        horizon = commands.shape[1]
+        if (commands == commands[:, :1]).all():  # a command that is held is approached straight
+            reach = step * np.arange(1, horizon + 1)[:, None]
+            return np.clip(commands, executed - reach, executed + reach)
+        limited = np.empty_like(commands)
+        for k in range(horizon):
+            executed = np.clip(commands[:, k], executed - step, executed + step)
+            limited[:, k] = executed
+        return limited
+
+    def _predict(self, state: RobotState, decisions: np.ndarray, mode: Mode) -> Prediction:
+        """Roll decisions out; grippers stay as they are. Shape (K, H, n)."""
+        count = self.decision.num_commands
+        arms = state.arms
+        if self.command_model.body[count:].any():
+            grippers = np.broadcast_to(
+                arms[len(self.decision.joints) :],
+                (*decisions.shape[:2], len(arms) - len(self.decision.joints)),
+            )
+            arms = np.concatenate([decisions[..., count:], grippers], axis=-1)
+        return self.rollout.predict(
+            state.qpos, state.qvel, state.memory, decisions[..., :count], arms, mode
+        )._replace(commands=decisions)
 
     def _evaluate(
         self,
         prediction: Prediction,
-        samples: Samples,
-        goals: Mapping[str, np.ndarray],
+        commands: np.ndarray,
         goal: Goal,
-        reference: np.ndarray,
+        executed: np.ndarray,
+        proposal: np.ndarray,
         wanted: np.ndarray,
+        drift: np.ndarray,
         config: MpcConfig,
-    ) -> dict[str, np.ndarray]:
-        """Cost of every sample by term. Shapes (K,)."""
-        sites = {name: self.sites[name] for name in goals}
+    ) -> Evaluation:
+        """All that the cost terms are computed from."""
+        references = {
+            "proposal": proposal,
+            "neutral": self.space.neutral,
+            "zero": np.zeros(len(executed)),
+        }
+        decided = self.command_model.acting(goal.mode)
+        reference = np.where(decided, references[config.control_reference], commands[0, 0])
         extrapolated = self.command_model.extrapolate(
             prediction.qpos[:, -1],
-            samples.commands[:, -1],
+            commands[:, -1],
             config.extrapolation_s,
             goal.mode,
-            self.drift.drift,
+            drift,
             executed=prediction.commands[:, -1],
         )
-        names, supported = tuple(sites.values()), self.support is not None
-        then = self.kinematics.compute_bodies(extrapolated, (*names, *self._hull), com=supported)
-        ahead = self.kinematics.compute_bodies(
-            prediction.qpos, (*names, *self._points), com=supported
-        )
-        terminal, poses = then.compute_poses(names), ahead.compute_poses(names)
-        last = config.horizon * POLICY_DT + config.extrapolation_s
-        evaluation = Evaluation(
+        sites = {name: site for name, site in self.sites.items() if name in goal.poses}
+        ahead = np.arange(config.horizon + 1) * POLICY_DT
+        last = ahead[-1] + config.extrapolation_s
+        goals = self._preview(goal, np.append(ahead, last), config)
+        now = self.readings.read(prediction.sensordata, sites)
+        then = self.readings.place(extrapolated, sites)
+        return Evaluation(
             qpos=prediction.qpos,
             qvel=prediction.qvel,
-            commands=samples.commands,
+            commands=commands,
+            executed=executed,
             reference=reference,
-            poses={name: poses[site] for name, site in sites.items()},
-            points=ahead.compute_positions(self._points),
-            terminal_points=then.compute_positions(self._hull),
-            com=ahead.compute_com() if supported else np.zeros(0),
+            poses=now.poses,
+            points=now.points,
+            velocities=now.velocities,
+            com=now.com,
             terminal_qpos=extrapolated,
-            terminal_com=then.compute_com() if supported else np.zeros(0),
-            goals=goals,
-            terminal_poses={name: terminal[site] for name, site in sites.items()},
-            terminal_goals={
-                name: poses[0] for name, poses in self._preview(goal, _at(last), config).items()
-            },
+            terminal_poses=then.poses,
+            terminal_points=then.points,
+            terminal_com=then.com,
+            goals={name: poses[:-1] for name, poses in goals.items()},
+            terminal_goals={name: poses[-1] for name, poses in goals.items()},
             wanted_velocity=wanted,
             mode=goal.mode,
             dt=POLICY_DT,
             weights=config.weights,
+            upright=tuple(sites) if "upright" in self.constraints else (),
         )
-        return {cost.name: cost.compute(evaluation) for cost in self.costs}
 
-
-def _at(time: float) -> np.ndarray:
-    return np.array([time])
+    def _apply(
+        self,
+        verdict: Verdict,
+        planner: SamplingOptimizer,
+        commands: np.ndarray,
+        executed: np.ndarray,
+    ) -> np.ndarray:
+        """The plan after the verdict on it. Shape (H, n)."""
+        if verdict.sample is not None:
+            planner.reset(commands[verdict.sample, 0])
+        elif verdict.scale < 1.0:
+            base = planner.commands[0] if verdict.scale > 0 else executed
+            slowed = np.where(self.command_model.is_velocity(), verdict.scale * base, base)
+            planner.reset(slowed)
+        return planner.commands
 
 
 def _override(config: MpcConfig, settings: RetargeterConfig) -> MpcConfig:
@@ -342,4 +467,4 @@ def _override(config: MpcConfig, settings: RetargeterConfig) -> MpcConfig:
         for name in ("num_samples", "horizon", "control_hz")
         if getattr(settings, name)
     }
-    return dataclasses.replace(config, **wanted)
+    return replace(config, **wanted)

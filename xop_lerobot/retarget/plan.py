@@ -30,7 +30,10 @@ class Plan:
         commands: The planned sequence, one for each control step. Shape (H, k).
         mode: The mode it is for.
         qpos: Predicted positions under the plan's best sample; empty for `direct`. (H + 1, nq).
+        arms: Targets of the arm joints that the retargeter decided itself, by joint, one for
+            each control step [rad]; the others are left to inverse kinematics. Shapes (H,).
         cost: Cost of the best sample by term.
+        health: Further figures by name: `intervention` (see `Intervention`) and `risk`.
         status: How the solve ended.
         effective_samples: Effective sample size of the update [1].
         timings: Time spent, by part [s]; ``"solve"`` is the whole.
@@ -40,7 +43,9 @@ class Plan:
     commands: np.ndarray
     mode: Mode
     qpos: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    arms: Mapping[str, np.ndarray] = field(default_factory=dict)
     cost: Mapping[str, float] = field(default_factory=dict)
+    health: Mapping[str, float] = field(default_factory=dict)
     status: Status = Status.OK
     effective_samples: float = 1.0
     timings: Mapping[str, float] = field(default_factory=dict)

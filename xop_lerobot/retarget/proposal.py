@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import daqp
+import mujoco
 import numpy as np
 
 from xop_lerobot.command import Mode
@@ -13,11 +15,13 @@ from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.lateral import compute_lateral
 from xop_lerobot.retarget.costs.support import SupportArea
-from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.transforms import heading_error
+from xop_lerobot.retarget.heading import linearise_heading
+from xop_lerobot.retarget.linearisation import Linearisation, find_site
+from xop_lerobot.transforms import quat_rotate, quat_yaw
 
 _DAMPING = 1e-3  # of the first step, in shares of a command's scale
-_STEP = 1e-4  # finite-difference step, in shares of a command's scale
+_CONVERGED = 1e-4  # a step that small ends the iteration, in shares of a command's scale
+_DAQP_OPTIMAL = 1
 
 
 @dataclass(frozen=True)
@@ -55,33 +59,38 @@ class KinematicProposal:
 
     φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` the neutral
     command, s half the range of each entry and ρ its effort. A few
-    Levenberg-Marquardt steps within the bounds; the Jacobian by finite differences, all columns
-    in one batch.
+    Levenberg-Marquardt steps within the bounds, each a small quadratic program solved by DAQP;
+    the Jacobian is :math:`J_{site}(\phi)\,\partial\phi/\partial a`, by MuJoCo.
 
     Args:
+        model: The robot's model.
         command_model: What a command does.
-        kinematics: Kinematics of the tracked frames' sites.
         sites: Site of each tracked frame.
         weights: Weights of the errors.
         support: Area over which the centre of mass stays, None for a robot that balances itself.
-        iterations: Number of linearisations.
+        base_body: The robot's root body, whose centre of mass `support` is about.
+        iterations: Largest number of linearisations.
     """
 
     def __init__(
         self,
+        model: mujoco.MjModel,
         command_model: CommandModel,
-        kinematics: SiteKinematics,
         sites: Mapping[str, str],
         weights: ProposalWeights | None = None,
         support: SupportArea | None = None,
+        base_body: str = "",
         iterations: int = 6,
     ) -> None:
-        self.command_model, self.kinematics, self.sites = command_model, kinematics, dict(sites)
+        self.command_model, self.sites = command_model, dict(sites)
         self.weights = weights or ProposalWeights()
         self.support, self.iterations = support, iterations
+        self._linearisation = Linearisation(model)
+        self._site_ids = {name: find_site(model, site) for name, site in self.sites.items()}
+        self._base = model.body(base_body).id if support is not None else 0
         space = command_model.space
         self.scale = (space.high - space.low) / 2
-        self._effort = self.weights.effort * np.array([e.effort for e in command_model.effects])
+        self._effort = np.array([e.effort for e in command_model.effects])
 
     def solve(
         self,
@@ -123,83 +132,110 @@ class KinematicProposal:
             low = np.maximum(low, executed - space.max_rate * dt)
             high = np.minimum(high, executed + space.max_rate * dt)
         low, high = low[index], high[index]
+        high = np.maximum(low, high)  # an executed command may be out of the bounds
         command[index] = np.clip(command[index], low, high)
-        scale, effort = self.scale[index], self._effort[index]
-
-        def compute_residuals(commands: np.ndarray) -> np.ndarray:
-            future = self.command_model.extrapolate(qpos, commands, dt, mode, drift, executed)
-            return self._compute_residuals(future, goals, wanted_velocity)
+        scale, effort = self.scale[index], self.weights.effort * self._effort[index]
+        none, sense = np.zeros((0, len(index))), np.zeros(len(index), dtype=np.int32)
 
         best, least, damping = command, np.inf, _DAMPING
         matrix = gradient = np.zeros(0)
         for _ in range(self.iterations):
-            batch = np.tile(command, (len(index) + 1, 1))
-            batch[np.arange(1, len(index) + 1), index] += _STEP * scale
-            residuals = compute_residuals(batch)
+            residual, jacobian = self.linearise(
+                qpos, command, goals, mode, dt, drift, executed, wanted_velocity
+            )
             share = (command[index] - space.neutral[index]) / scale
-            cost = np.square(residuals[0]).sum() + np.square(effort * share).sum()
+            cost = residual @ residual + np.square(effort * share).sum()
             if cost < least:  # a better point: linearise there, trust the step more
                 best, least, damping = command, cost, damping / 4
-                jacobian = (residuals[1:] - residuals[0]).T / _STEP  # per share of scale
-                matrix = jacobian.T @ jacobian + np.diag(np.square(effort))
-                gradient = jacobian.T @ residuals[0] + np.square(effort) * share
+                scaled = jacobian[:, index] * scale
+                matrix = scaled.T @ scaled + np.diag(np.square(effort))
+                gradient = scaled.T @ residual + np.square(effort) * share
             elif not np.isfinite(least):
                 return command  # not a number: nothing to improve on
             else:
                 damping *= 16
-            step = _solve_in_box(
-                matrix + damping * np.eye(len(index)),
-                gradient,
-                (low - best[index]) / scale,
-                (high - best[index]) / scale,
-            )
+            damped = matrix + damping * np.eye(len(index))
+            upper, lower = (high - best[index]) / scale, (low - best[index]) / scale
+            step, _, status, _ = daqp.solve(damped, gradient, none, upper, lower, sense)
+            if status != _DAQP_OPTIMAL or np.abs(step).max() < _CONVERGED:
+                break
             command = best.copy()
             command[index] = np.clip(best[index] + scale * step, low, high)
         return best
 
-    def _compute_residuals(
+    def linearise(
+        self,
+        qpos: np.ndarray,
+        command: np.ndarray,
+        goals: Mapping[str, np.ndarray],
+        mode: Mode,
+        dt: float,
+        drift: np.ndarray | None = None,
+        executed: np.ndarray | None = None,
+        wanted_velocity: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the weighted errors after `dt` of a command and their derivative by it.
+
+        Args: as for `solve`.
+
+        Returns:
+            Residuals, shape (m,), and their Jacobian, shape (m, k).
+        """
+        model, weights = self.command_model, self.weights
+        future = model.extrapolate(qpos, command, dt, mode, drift, executed)
+        motion = model.compute_jacobian(qpos, command, dt, mode, drift, executed)
+        self._linearisation.update(future)
+        residuals, jacobians = [], []
+        for name, goal in goals.items():
+            position, quat, linear, angular = self._linearisation.compute_site(self._site_ids[name])
+            gain = np.array(weights.position)
+            residuals.append((position - goal[:3]) * gain)
+            jacobians.append(gain[:, None] * (linear @ motion))
+            error, by_rotation = linearise_heading(goal[3:], quat)
+            gain = np.array(weights.orientation)
+            residuals.append(-error * gain)
+            jacobians.append(gain[:, None] * (by_rotation @ (angular @ motion)))
+        if self.support is not None:
+            self._add_support(future, motion, residuals, jacobians)
+        if model.is_nonholonomic and wanted_velocity is not None and weights.lateral:
+            self._add_lateral(future, motion, wanted_velocity, residuals, jacobians)
+        return np.concatenate(residuals), np.concatenate(jacobians)
+
+    def _add_support(
         self,
         future: np.ndarray,
-        goals: Mapping[str, np.ndarray],
-        wanted_velocity: np.ndarray | None,
-    ) -> np.ndarray:
-        """Weighted errors of a batch of extrapolated configurations. Shape (n, residuals)."""
-        sites = tuple(self.sites[name] for name in goals)
-        bodies = self.kinematics.compute_bodies(future, sites, com=self.support is not None)
-        poses = bodies.compute_poses(sites)
-        parts = []
-        for name, goal in goals.items():
-            pose = poses[self.sites[name]]
-            parts.append((pose[:, :3] - goal[:3]) * self.weights.position)
-            parts.append(-heading_error(goal[3:], pose[:, 3:]) * self.weights.orientation)
-        if self.support is not None:
-            com = bodies.compute_com()[:, :2]
-            base = future[:, :7]
-            parts.append(self.weights.support * self.support.compute_excess(base, com))
-            parts.append(self.weights.lean * self.support.compute_lean(base, com))
-        if self.command_model.is_nonholonomic and wanted_velocity is not None:
-            lateral = compute_lateral(future[:, :7], wanted_velocity)
-            parts.append(self.weights.lateral * lateral[:, None])
-        return np.concatenate(parts, axis=1)
+        motion: np.ndarray,
+        residuals: list[np.ndarray],
+        jacobians: list[np.ndarray],
+    ) -> None:
+        """Centre of mass beyond the support area, and from where it rests on the base."""
+        assert self.support is not None
+        com, by_joints = self._linearisation.compute_com(self._base)
+        yaw = float(quat_yaw(future[3:7]))
+        to_base = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+        # The base takes its mass with it: in the base's frame only joints move the centre.
+        place = to_base @ (by_joints[:2, 6:] @ motion[6:])
+        excess, by_place = self.support.linearise_excess(future[:7], com[:2])
+        residuals.append(self.weights.support * excess)
+        jacobians.append(self.weights.support * (by_place @ place))
+        if self.weights.lean:
+            lean, by_place = self.support.linearise_lean(future[:7], com[:2])
+            residuals.append(self.weights.lean * lean)
+            jacobians.append(self.weights.lean * (by_place @ place))
 
-
-def _solve_in_box(
-    matrix: np.ndarray, gradient: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Minimise x'Hx/2 + g'x over low <= x <= high by fixing violated entries, worst first."""
-    x = np.zeros(len(gradient))
-    fixed = np.zeros(len(gradient), dtype=bool)
-    for _ in range(len(gradient)):
-        free = ~fixed
-        if not free.any():
-            break
-        rhs = -gradient[free] - matrix[np.ix_(free, fixed)] @ x[fixed]
-        x[free] = np.linalg.solve(matrix[np.ix_(free, free)], rhs)
-        excess = np.maximum(low - x, x - high)
-        excess[fixed] = 0
-        worst = int(np.argmax(excess))
-        if excess[worst] <= 1e-12:  # noqa: PLR2004
-            break
-        x[worst] = np.clip(x[worst], low[worst], high[worst])
-        fixed[worst] = True
-    return np.clip(x, low, high)
+    def _add_lateral(
+        self,
+        future: np.ndarray,
+        motion: np.ndarray,
+        wanted: np.ndarray,
+        residuals: list[np.ndarray],
+        jacobians: list[np.ndarray],
+    ) -> None:
+        """Wanted velocity across the heading, which wheels cannot give."""
+        yaw = float(quat_yaw(future[3:7]))
+        lateral = compute_lateral(future[:7], wanted)
+        along = math.cos(yaw) * wanted[0] + math.sin(yaw) * wanted[1]
+        # A turn about the vertical by one radian turns the heading by one.
+        turn = quat_rotate(future[3:7], motion[3:6].T)[:, 2]
+        residuals.append(np.array([self.weights.lateral * lateral]))
+        jacobians.append(-self.weights.lateral * along * turn[None])

@@ -24,6 +24,10 @@ class Prediction(NamedTuple):
         qpos: Positions at each control step, the first is the start. Shape (K, H + 1, nq).
         qvel: Velocities at each control step. Shape (K, H + 1, nv).
         commands: The commands that were rolled out. Shape (K, H, k).
+        sensordata: Sensors of the planning model, first at the start, then one physics step
+            before the end of each control step: MuJoCo reads them as a step begins. Shape
+            (K, H + 1, nsensordata).
+        memory: The policy's memory at the end. Shape (K, nm).
         policy_s: Time in the low-level policy [s].
         physics_s: Time in MuJoCo [s].
     """
@@ -31,6 +35,8 @@ class Prediction(NamedTuple):
     qpos: np.ndarray
     qvel: np.ndarray
     commands: np.ndarray
+    sensordata: np.ndarray
+    memory: np.ndarray
     policy_s: float
     physics_s: float
 
@@ -62,6 +68,7 @@ class PolicyRollout:
         # One thread means the caller's own: a pool of one would only add a hand-over.
         self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(model) for _ in range(max(num_threads, 1))]
+        self._start = mujoco.MjData(model)
 
     def close(self) -> None:
         """Stop the threads."""
@@ -83,7 +90,8 @@ class PolicyRollout:
             qvel: Start velocity. Shape (nv,).
             memory: The policy's memory h at the start. Shape (nm,).
             commands: Command sequences. Shape (K, H, k).
-            arms: Arm and gripper targets, held. Shape (m,).
+            arms: Arm and gripper targets: held, or a sequence for each sample. Shape (m,) or
+                (K, H, m).
             mode: Mode of the low-level policy.
 
         Returns:
@@ -91,13 +99,15 @@ class PolicyRollout:
         """
         nq, nv = self.model.nq, self.model.nv
         num_rollouts, horizon, _ = commands.shape
-        state = np.zeros((num_rollouts, 1 + nq + nv + self.model.na))
-        state[:, 1 : 1 + nq], state[:, 1 + nq : 1 + nq + nv] = qpos, qvel
-        out = np.empty((num_rollouts, self.substeps, state.shape[1]))
-        states = np.empty((num_rollouts, horizon + 1, state.shape[1]))
-        states[:, 0] = state
+        states = np.empty((num_rollouts, horizon + 1, 1 + nq + nv + self.model.na))
+        states[:, 0] = 0
+        states[:, 0, 1 : 1 + nq], states[:, 0, 1 + nq : 1 + nq + nv] = qpos, qvel
+        out = np.empty((num_rollouts, self.substeps, states.shape[2]))
+        sensed = np.empty((num_rollouts, self.substeps, self.model.nsensordata))
+        sensordata = np.empty((num_rollouts, horizon + 1, self.model.nsensordata))
+        sensordata[:, 0] = self._sense(qpos, qvel)
+        arms = np.broadcast_to(arms, (num_rollouts, horizon, arms.shape[-1]))
         memory = np.broadcast_to(memory, (num_rollouts, len(memory)))
-        arms = np.broadcast_to(arms, (num_rollouts, len(arms)))
         policy_s = physics_s = 0.0
         for step in range(horizon):
             start = perf_counter()
@@ -105,7 +115,7 @@ class PolicyRollout:
                 states[:, step, 1 : 1 + nq],
                 states[:, step, 1 + nq : 1 + nq + nv],
                 commands[:, step],
-                arms,
+                arms[:, step],
                 memory,
                 mode,
             )
@@ -117,16 +127,32 @@ class PolicyRollout:
                 targets[:, None],
                 nstep=self.substeps,
                 state=out,
+                sensordata=sensed,
             )
             states[:, step + 1] = out[:, -1]
+            sensordata[:, step + 1] = sensed[:, -1]
             end = perf_counter()
             policy_s += between - start
             physics_s += end - between
-        states[~(np.abs(states[..., 1:]) < _DIVERGED).all(axis=(1, 2))] = np.nan
+        sound = (np.abs(states[..., 1:]) < _DIVERGED).all(axis=(1, 2))
+        if not sound.all():
+            states[~sound] = sensordata[~sound] = np.nan
         return Prediction(
             states[..., 1 : 1 + nq],
             states[..., 1 + nq : 1 + nq + nv],
             commands,
+            sensordata,
+            memory,
             policy_s,
             physics_s,
         )
+
+    def _sense(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """Sensors at the start. Shape (nsensordata,)."""
+        data = self._start
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_fwdPosition(self.model, data)
+        mujoco.mj_sensorPos(self.model, data)
+        mujoco.mj_fwdVelocity(self.model, data)
+        mujoco.mj_sensorVel(self.model, data)
+        return data.sensordata

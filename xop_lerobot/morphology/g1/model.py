@@ -60,7 +60,7 @@ def build_g1(kind: str) -> mujoco.MjSpec:
         kind: ``"full"`` or ``"planning"``.
     """
     planning = kind == "planning"
-    spec = rows.new_spec("g1", TIMESTEP, planning)
+    spec = rows.new_spec("g1", TIMESTEP)
     rows.add_links(spec, LINKS, "floating_base_joint")
     for link in LINKS:
         if link.joint is None:

@@ -78,7 +78,7 @@ def build_rby1(kind: str) -> mujoco.MjSpec:
     import mujoco  # noqa: PLC0415
 
     planning = kind == "planning"
-    spec = rows.new_spec("rby1", TIMESTEP, planning)
+    spec = rows.new_spec("rby1", TIMESTEP)
     # The servos' damping is taken implicitly, which keeps stiff joints stable at this step.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     rows.add_links(spec, LINKS, "base_joint")

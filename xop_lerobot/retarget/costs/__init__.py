@@ -3,6 +3,7 @@
 from xop_lerobot.retarget.costs.collision import CollisionCost
 from xop_lerobot.retarget.costs.control import ControlCost
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.retarget.costs.factory import make_costs
 from xop_lerobot.retarget.costs.fall import FallCost
 from xop_lerobot.retarget.costs.lateral import LateralCost
 from xop_lerobot.retarget.costs.stance import StanceCost
@@ -24,4 +25,5 @@ __all__ = [
     "TerminalCost",
     "TrackingCost",
     "UprightCost",
+    "make_costs",
 ]

@@ -10,6 +10,8 @@ import numpy as np
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.obstacles import Obstacle, ObstacleSet, make_obstacles
 
+_DEEPER = 0.001  # what counts as going further in, where the hull already is inside [m]
+
 __all__ = ["CollisionCost", "Obstacle", "make_obstacles"]
 
 
@@ -65,6 +67,18 @@ class CollisionCost(Cost):
             distances, weights.collision_velocity_decay, weights.collision_range
         )
         return barrier[:, :-1].mean(axis=1) + barrier[:, -1]
+
+    def find_touches(self, evaluation: Evaluation) -> np.ndarray:
+        """Which samples touch an obstacle, more deeply than the start does. Shape (K,), bool."""
+        num = len(evaluation.qpos)
+        if not len(self.obstacles) or not self.points:
+            return np.zeros(num, dtype=bool)
+        hull = self._stack(evaluation.points)  # (K, H + 1, P, 3)
+        near = self.obstacles.find_near(hull, self._radii.max())
+        if not len(near):
+            return np.zeros(num, dtype=bool)
+        distances = self._compute_distances(hull, near).min(axis=-1)  # (K, H + 1)
+        return distances[:, 1:].min(axis=1) < np.minimum(distances[:, 0], 0) - _DEEPER
 
     def compute_clearance(
         self, points: Mapping[str, np.ndarray], which: np.ndarray | None = None

@@ -19,10 +19,14 @@ class Evaluation:
     Attributes:
         qpos: Predicted positions; step 0 is the start. Shape (K, H + 1, nq).
         qvel: Predicted velocities. Shape (K, H + 1, nv).
-        commands: Commands rolled out. Shape (K, H, k).
+        commands: Commands that are tried, before the rate limits. Shape (K, H, k).
+        executed: The command being executed. Shape (k,).
         reference: The command that costs nothing. Shape (k,).
-        poses: Predicted pose of each tracked frame. Shapes (K, H + 1, 7).
+        poses: Predicted pose of each tracked frame. Shapes (K, H + 1, 7). As all that is read
+            off the simulator, step 0 is the start, and the others are one physics step before
+            the end of each control step.
         points: Predicted position of contact and hull sites. Shapes (K, H + 1, 3).
+        velocities: Predicted velocity of contact sites [m/s]. Shapes (K, H + 1, 3).
         terminal_points: Position of those sites at the end of the extrapolation. Shape (K, 3).
         com: Predicted centre of mass, of robots with a support area. Shape (K, H + 1, 3).
         terminal_qpos: Position at the end of the extrapolation. Shape (K, nq).
@@ -40,9 +44,11 @@ class Evaluation:
     qpos: np.ndarray
     qvel: np.ndarray
     commands: np.ndarray
+    executed: np.ndarray
     reference: np.ndarray
     poses: Mapping[str, np.ndarray]
     points: Mapping[str, np.ndarray]
+    velocities: Mapping[str, np.ndarray]
     terminal_points: Mapping[str, np.ndarray]
     com: np.ndarray
     terminal_qpos: np.ndarray

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import quat_rotate
 
 
 class FallCost(Cost):
@@ -24,14 +23,24 @@ class FallCost(Cost):
     name = "fall"
 
     def __init__(self, tilt: float, height: float, standing_height: float) -> None:
+        self.tilt, self.height = tilt, height
         self.safe_tilt = tilt / 2
         self.safe_height = height + (standing_height - height) / 4
+
+    def find_falls(self, evaluation: Evaluation) -> np.ndarray:
+        """Which samples count as fallen at some predicted step. Shape (K,), bool."""
+        base = evaluation.qpos[:, 1:, :7]
+        fallen = (_compute_tilt(base) > self.tilt) | (base[..., 2] < self.height)
+        return fallen.any(axis=1)
 
     def compute(self, evaluation: Evaluation) -> np.ndarray:
         """Cost of every sample. Shape (K,)."""
         base = evaluation.qpos[:, 1:, :7]
-        up = quat_rotate(base[..., 3:], np.array([0.0, 0, 1]))[..., 2]
-        tilt = np.arccos(np.clip(up, -1, 1))
-        excess = np.square(np.maximum(0, tilt - self.safe_tilt))
+        excess = np.square(np.maximum(0, _compute_tilt(base) - self.safe_tilt))
         excess += np.square(np.maximum(0, self.safe_height - base[..., 2]))
         return evaluation.weights.fall * excess.mean(axis=1)
+
+
+def _compute_tilt(base: np.ndarray) -> np.ndarray:
+    """Angle of the base's Z to the vertical [rad]. Shape (..., 7) -> (...)."""
+    return np.arccos(np.clip(1 - 2 * (base[..., 4] ** 2 + base[..., 5] ** 2), -1, 1))

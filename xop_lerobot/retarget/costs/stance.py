@@ -11,10 +11,10 @@ from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 class StanceCost(Cost):
     r"""Mean over steps of :math:`w_s \sum_{i \in C_k} \|\dot p^c_{i,k}\|^2`.
 
-    The velocity of a contact point is its displacement over one control step. Points come in
-    groups that touch the ground together (the four of a foot); each group counts by the mean of
-    its points. C holds every group in stationary mode, and in mobile mode the lowest group of
-    each step, the standing foot. On wheels, which must roll, only stationary mode counts.
+    Points come in groups that touch the ground together (the four of a foot); each group counts
+    by the mean of its points. C holds every group in stationary mode, and in mobile mode the
+    lowest group of each step, the standing foot. On wheels, which must roll, only stationary
+    mode counts.
 
     Args:
         groups: Sites of each group of contact points.
@@ -32,8 +32,9 @@ class StanceCost(Cost):
             return np.zeros(len(evaluation.qpos))
         speeds, heights = [], []
         for group in self.groups:
-            points = np.stack([evaluation.points[site] for site in group])  # (p, K, H + 1, 3)
-            speeds.append(np.square(np.diff(points, axis=2) / evaluation.dt).sum(-1).mean(0))
+            velocities = np.stack([evaluation.velocities[site] for site in group])
+            speeds.append(np.square(velocities[:, :, 1:]).sum(-1).mean(0))  # (K, H)
+            points = np.stack([evaluation.points[site] for site in group])
             heights.append(points[:, :, 1:, 2].mean(0))
         speed = np.stack(speeds)  # (groups, K, H)
         if evaluation.mode is Mode.STATIONARY:

@@ -48,6 +48,31 @@ class SupportArea:
         length = np.linalg.norm(offset, axis=-1, keepdims=True)
         return offset * np.maximum(0, 1 - self._free / np.maximum(length, 1e-9))
 
+    def linearise_excess(
+        self, base: np.ndarray, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`compute_excess` of one point, and its derivative by the place in the base's frame.
+
+        Shapes (7,), (2,) -> (c,), (c, 2).
+        """
+        excess = self._normals @ _to_base(base, point) - self._offsets
+        outside = excess > 0
+        return np.where(outside, excess, 0.0), self._normals * outside[:, None]
+
+    def linearise_lean(self, base: np.ndarray, com: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`compute_lean` of one place, and its derivative by the place in the base's frame.
+
+        Shapes (7,), (2,) -> (2,), (2, 2).
+        """
+        offset = _to_base(base, com) - self._resting
+        length = float(np.linalg.norm(offset))
+        if length <= self._free:
+            return np.zeros(2), np.zeros((2, 2))
+        along = offset / length
+        share = 1 - self._free / length
+        # Radially the length beyond the circle changes, across only the direction does.
+        return offset * share, share * np.eye(2) + (1 - share) * np.outer(along, along)
+
 
 def _to_base(base: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points in the base's place and heading. (..., 7), (..., 2) -> (..., 2)."""
@@ -83,12 +108,14 @@ class SupportCost(Cost):
         """Cost of every sample. Shape (K,)."""
         if self.area is None:
             return np.zeros(len(evaluation.qpos))
-        com, dt = evaluation.com, evaluation.dt
+        com, dt = evaluation.com[:, 1:], evaluation.dt
         velocity = np.diff(com[..., :2], axis=1) / dt
-        span = max(velocity.shape[1] - 1, 1) * dt
-        acceleration = (velocity[:, -1] - velocity[:, 0]) / span
+        acceleration = np.zeros((len(com), 2))  # two steps or less do not tell
+        if velocity.shape[1] > 1:
+            span = (velocity.shape[1] - 1) * dt
+            acceleration = (velocity[:, -1] - velocity[:, 0]) / span
         zmp = com[..., :2] - com[..., 2:] / GRAVITY * acceleration[:, None]
-        moving = self.area.compute_excess(evaluation.qpos[..., :7], zmp)
+        moving = self.area.compute_excess(evaluation.qpos[:, 1:, :7], zmp)
         base, com = evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
         resting = self.area.compute_excess(base, com)
         excess = np.square(moving).sum(-1).mean(-1) + np.square(resting).sum(-1)

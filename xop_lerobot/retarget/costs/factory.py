@@ -1,0 +1,38 @@
+"""Makes the cost terms of a robot."""
+
+from __future__ import annotations
+
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.costs.collision import CollisionCost
+from xop_lerobot.retarget.costs.control import ControlCost
+from xop_lerobot.retarget.costs.cost import Cost
+from xop_lerobot.retarget.costs.fall import FallCost
+from xop_lerobot.retarget.costs.lateral import LateralCost
+from xop_lerobot.retarget.costs.stance import StanceCost
+from xop_lerobot.retarget.costs.support import SupportArea, SupportCost
+from xop_lerobot.retarget.costs.terminal import TerminalCost
+from xop_lerobot.retarget.costs.tracking import TrackingCost
+from xop_lerobot.retarget.costs.upright import UprightCost
+
+
+def make_costs(
+    morphology: Morphology,
+    command_model: CommandModel,
+    support: SupportArea | None,
+    collision: CollisionCost,
+    fall: FallCost,
+) -> tuple[Cost, ...]:
+    """Make all terms; those that a robot has no use for cost nothing."""
+    space = command_model.space
+    return (
+        TrackingCost(),
+        TerminalCost(),
+        StanceCost(morphology.contact_groups, morphology.wheeled),
+        collision,
+        ControlCost((space.high - space.low) / 2),
+        UprightCost(),
+        SupportCost(support),
+        LateralCost(command_model.is_nonholonomic),
+        fall,
+    )

@@ -1,0 +1,59 @@
+"""Goals over the horizon: held within reach, and carried on at their velocity."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from xop_lerobot.state import Goal
+from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
+
+
+def hold_near(goal: Goal, poses: Mapping[str, np.ndarray], reach: float) -> Goal:
+    """Move goals that are further than `reach` aside of their frame up to that distance.
+
+    A goal metres away must not bend the robot towards it; walking there is another matter.
+
+    Args:
+        goal: The goal.
+        poses: Where the frames are that are to be followed. Shapes (7,).
+        reach: Largest horizontal distance [m].
+    """
+    near = dict(goal.poses)
+    for name, pose in poses.items():
+        if name in near:
+            offset = near[name][:3] - pose[:3]
+            share = min(1.0, reach / max(float(np.hypot(offset[0], offset[1])), 1e-9))
+            held = pose[:3] + np.array([share, share, 1.0]) * offset
+            near[name] = make_pose(held, near[name][3:])
+    return dataclasses.replace(goal, poses=near)
+
+
+def preview(
+    goal: Goal, frames: tuple[str, ...], ahead: np.ndarray, preview_s: float
+) -> dict[str, np.ndarray]:
+    """Compute the goals of `frames` at the times `ahead`.
+
+    Args:
+        goal: The goal now, with its velocities.
+        frames: Tracked frames; those without a goal are left out.
+        ahead: Times from now [s]. Shape (n,).
+        preview_s: Time after which a goal is assumed to stand still [s].
+
+    Returns:
+        Poses. Shapes (n, 7).
+    """
+    times = np.minimum(ahead, preview_s)[:, None]
+    goals = {}
+    for name in frames:
+        if name not in goal.poses:
+            continue
+        pose, velocity = goal.poses[name], goal.velocities.get(name)
+        if velocity is None or not np.any(velocity):
+            goals[name] = np.broadcast_to(pose, (len(times), 7))
+            continue
+        position = pose[:3] + times * velocity[:3]
+        goals[name] = make_pose(position, quat_multiply(quat_exp(times * velocity[3:]), pose[3:]))
+    return goals

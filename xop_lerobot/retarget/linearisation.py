@@ -1,0 +1,116 @@
+"""Places and derivatives of one configuration, by MuJoCo."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.errors import UnknownName
+
+
+def find_site(model: mujoco.MjModel, name: str) -> int:
+    """Return the number of a site.
+
+    Raises:
+        UnknownName: Listing the model's sites.
+    """
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
+    if index < 0:
+        raise UnknownName("site", name, [model.site(i).name for i in range(model.nsite)])
+    return index
+
+
+class Linearisation:
+    r"""Kinematics and Jacobians at one configuration at a time.
+
+    A pass over the tree is 4 µs, a Jacobian 1 µs; for batches see `SiteKinematics`.
+
+    Args:
+        model: The robot's model.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model, self._data = model, mujoco.MjData(model)
+
+    def update(self, qpos: np.ndarray) -> None:
+        """Place all bodies at `qpos`. Shape (nq,)."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self._data)
+        mujoco.mj_comPos(self.model, self._data)
+
+    def compute_site(self, site: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        r"""Place a site.
+
+        Returns:
+            Position [m] (3,), orientation wxyz (4,), and the Jacobians of its linear and angular
+            velocity in the world by :math:`\dot q`. Shapes (3, nv), (3, nv).
+        """
+        quat = np.empty(4)
+        mujoco.mju_mat2Quat(quat, self._data.site_xmat[site])
+        linear = np.empty((3, self.model.nv))
+        angular = np.empty((3, self.model.nv))
+        mujoco.mj_jacSite(self.model, self._data, linear, angular, site)
+        return self._data.site_xpos[site], quat, linear, angular
+
+    def compute_com(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """Centre of mass of a body's subtree [m] (3,), and its Jacobian (3, nv)."""
+        jacobian = np.empty((3, self.model.nv))
+        mujoco.mj_jacSubtreeCom(self.model, self._data, jacobian, body)
+        return self._data.subtree_com[body], jacobian
+
+
+class Placement:
+    """Places sites and the centre of mass in a small batch of configurations.
+
+    One pass of MuJoCo for each, 4 µs: up to some hundred configurations that is faster than
+    NumPy's pass over the tree for all of them at once.
+
+    Args:
+        model: The robot's model.
+        poses: Sites whose poses are asked for.
+        points: Sites whose positions are asked for.
+        com_of: Body whose subtree's centre of mass is asked for, None if none is.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        poses: tuple[str, ...],
+        points: tuple[str, ...] = (),
+        com_of: str | None = None,
+    ) -> None:
+        self.model, self._data = model, mujoco.MjData(model)
+        self._names, self._points = poses, points
+        self._pose_ids = [find_site(model, site) for site in poses]
+        self._ids = np.array([find_site(model, site) for site in (*poses, *points)], dtype=int)
+        self._com = model.body(com_of).id if com_of else None
+
+    def compute(
+        self, qpos: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray]:
+        """Place everything. Shape (n, nq).
+
+        Returns:
+            Poses of the sites, shapes (n, 7); positions of the points, shapes (n, 3); centre of
+            mass, shape (n, 3), or (0,) where none was asked for.
+        """
+        model, data = self.model, self._data
+        positions = np.empty((len(qpos), len(self._ids), 3))
+        quats = np.empty((len(qpos), len(self._pose_ids), 4))
+        com = np.empty((len(qpos) if self._com is not None else 0, 3))
+        for i, configuration in enumerate(qpos):
+            data.qpos[:] = configuration
+            mujoco.mj_kinematics(model, data)
+            positions[i] = data.site_xpos[self._ids]
+            for j, site in enumerate(self._pose_ids):
+                mujoco.mju_mat2Quat(quats[i, j], data.site_xmat[site])
+            if self._com is not None:
+                mujoco.mj_comPos(model, data)
+                com[i] = data.subtree_com[self._com]
+        count = len(self._pose_ids)
+        poses = np.concatenate([positions[:, :count], quats], axis=2)
+        return (
+            {name: poses[:, i] for i, name in enumerate(self._names)},
+            {name: positions[:, count + i] for i, name in enumerate(self._points)},
+            com,
+        )
