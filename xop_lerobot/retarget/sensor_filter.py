@@ -5,6 +5,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+_GROUPS = (slice(0, 3), slice(3, 5), slice(5, 6), slice(6, None))
+"""Degrees of freedom that one sensor measures: position, tilt, heading, joints."""
+
+_LEARNING = 0.05  # share of the newest sample in a sensor's observed noise
+_NOISE_RANGE = (0.1, 10.0)  # observed noise over the configured one
+_TREND = 0.3  # share of the newest sample in the mean disagreement
+
 
 class SensorFilter:
     r"""A Kalman filter per degree of freedom: measured positions over integrated velocities.
@@ -14,104 +21,120 @@ class SensorFilter:
 
     .. math::
 
-        \bar x = x_{k-1} \oplus \tfrac12 (v_{k-1} + \tilde v_k) \Delta t, \quad
-        \bar P = P_{k-1} + Q \Delta t^2, \quad
-        x_k = \bar x \oplus K (\tilde x_k \ominus \bar x), \quad K = \bar P / (\bar P + R)
+        \bar x = x_{k-1} \oplus v \Delta t, \quad \bar P = P_{k-1} + Q \Delta t^2, \quad
+        x_k = \bar x \oplus K e, \quad e = \tilde x_k \ominus \bar x, \quad
+        K = \bar P / (\bar P + R)
 
-    with R the variance of a measured position, Q that of a velocity. Orientation errors are in
+    with R the variance of a measured position, Q that of the velocity. Orientation errors are in
     the world's axes, so that tilt and heading keep their own sensors.
+
+    - R is observed: of white noise, :math:`E (e_k - e_{k-1})^2 \approx 2 R`, whatever offset
+      or drift the sensor has besides. It starts as configured and stays within a tenth and ten
+      times of that (standard deviations).
+    - A pose of the base that repeats to the last bit is the lidar's last one, held: no news of
+      position and heading.
+    - A measurement further away than `gate` standard deviations, or on average over a few ticks
+      further than that average of mere noise would be, begins its sensor anew.
 
     Args:
         model: Robot on a free base.
         position_std: Of the measured position along each degree of freedom, the orientation's
             about world axes [m, rad]. Shape (nv,).
-        velocity_std: Of the velocity that carries it [m/s, rad/s]. Shape (nv,).
-        gate: Disagreement at which an entry begins anew, in standard deviations [1].
+        gate: See above [1].
     """
 
-    def __init__(
-        self,
-        model: mujoco.MjModel,
-        position_std: np.ndarray,
-        velocity_std: np.ndarray,
-        gate: float,
-    ) -> None:
+    def __init__(self, model: mujoco.MjModel, position_std: np.ndarray, gate: float) -> None:
         self.model = model
-        self._noise, self._process = np.square(position_std), np.square(velocity_std)
+        self._configured = np.square(position_std)
         self._gate = gate
-        self._qpos = model.qpos0.copy()
-        self._variance: np.ndarray | None = None
-        self._measured = np.full(model.nq, np.nan)
-        self._innovation = np.zeros(model.nv)
-        self._trend = np.zeros(model.nv)
+        self._qpos, self._held = model.qpos0.copy(), np.full(3, np.nan)
+        self._noise = self._configured.copy()
+        self._variance = self._noise
+        self._innovation, self._trend = np.zeros((2, model.nv))
+        self._is_new = True
 
     def reset(self) -> None:
         """Forget everything."""
-        self._variance = None
-        self._measured = np.full_like(self._measured, np.nan)
+        self._is_new = True
 
     @property
     def std(self) -> np.ndarray:
         """Standard deviation of the estimate along each degree of freedom. Shape (nv,)."""
-        return np.sqrt(self._noise if self._variance is None else self._variance)
+        return np.sqrt(self._variance)
 
-    def update(self, qpos: np.ndarray, qvel: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
+    @property
+    def position_noise(self) -> float:
+        """Observed standard deviation of a measured position of the base [m]."""
+        return float(np.sqrt(self._noise[0]))
+
+    def update(
+        self, qpos: np.ndarray, qvel: np.ndarray, variance: np.ndarray, dt: float
+    ) -> tuple[np.ndarray, bool]:
         """Take in a measurement.
 
         Args:
             qpos: Measured position. Shape (nq,).
-            qvel: Velocity over the time since the last update. Shape (nv,).
+            qvel: Mean velocity since the last update. Shape (nv,).
+            variance: Its variances. Shape (nv,).
             dt: That time [s].
 
         Returns:
-            The estimate, and whether the pose of the base began anew. Shape (nq,).
+            The estimate (nq,), and whether the base's pose began anew.
         """
-        if self._variance is None:
+        if self._is_new:
             self._start(qpos)
             return qpos.copy(), False
-        estimate, turned = self._qpos, np.zeros(self.model.nv)
+        estimate = self._qpos
         mujoco.mj_integratePos(self.model, estimate, qvel, dt)
-        variance = self._variance + self._process * (dt * dt)
-        innovation = np.zeros(self.model.nv)
-        mujoco.mj_differentiatePos(self.model, innovation, 1.0, estimate, qpos)
+        predicted = self._variance + variance * (dt * dt)
+        error = np.empty(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, error, 1.0, estimate, qpos)
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, estimate[3:7])
         rotation = rotation.reshape(3, 3)
-        innovation[3:6] = rotation @ innovation[3:6]
-        gain = variance / (variance + self._noise)
-        if np.array_equal(qpos[:3], self._measured[:3]):
-            # The lidar's last pose again: no news of position and heading.
-            gain[:3] = gain[5] = 0.0
-        lost = self._find_lost(innovation, variance, gain > 0)
+        error[3:6] = rotation @ error[3:6]
+        fresh = np.ones(self.model.nv, dtype=bool)
+        if np.array_equal(qpos[:3], self._held):
+            fresh[:3] = fresh[5] = False
+        self._held = qpos[:3].copy()
+        lost = self._find_lost(error, predicted, fresh)
+        self._observe_noise(error, fresh & ~lost)
+        gain = np.where(fresh, predicted / (predicted + self._noise), 0.0)
         gain[lost] = 1.0
-        turned[:] = gain * innovation
-        turned[3:6] = rotation.T @ turned[3:6]
-        mujoco.mj_integratePos(self.model, estimate, turned, 1.0)
-        self._variance = np.where(lost, self._noise, (1 - gain) * variance)
-        self._measured = qpos.copy()
+        step = gain * error
+        step[3:6] = rotation.T @ step[3:6]
+        mujoco.mj_integratePos(self.model, estimate, step, 1.0)
+        self._variance = np.where(lost, self._noise, (1 - gain) * predicted)
         return estimate.copy(), bool(lost[:6].any())
 
     def _start(self, qpos: np.ndarray) -> None:
-        self._qpos, self._measured = qpos.copy(), qpos.copy()
+        self._qpos, self._held = qpos.copy(), qpos[:3].copy()
+        self._noise = self._configured.copy()
         self._variance = self._noise.copy()
-        self._trend[:] = 0
+        self._innovation[:] = self._trend[:] = 0
+        self._is_new = False
 
-    def _find_lost(
-        self, innovation: np.ndarray, variance: np.ndarray, fresh: np.ndarray
-    ) -> np.ndarray:
-        """Entries that disagree once by too much, or a little less for several ticks."""
-        spread = np.sqrt(variance + self._noise)
-        blend = np.where(fresh, 0.3, 0.0)
-        self._trend += blend * (innovation / spread - self._trend)
-        # A mean with forgetting 0.3 has 0.42 of the noise of one tick.
-        lost = fresh & (
-            (np.abs(innovation) > self._gate * spread)
-            | (
-                np.abs(self._trend) > 0.42 * self._gate  # noqa: PLR2004
-            )
-        )
-        for part in (slice(0, 3), slice(3, 6)):
-            if lost[part].any():
-                lost[part] = fresh[part]
+    def _observe_noise(self, error: np.ndarray, fresh: np.ndarray) -> None:
+        """Follow the white noise of each sensor by what differs from one sample to the next."""
+        low, high = _NOISE_RANGE
+        difference = 0.5 * np.square(error - self._innovation) / self._configured
+        for group in _GROUPS:
+            if not fresh[group].all() or not difference[group].size:
+                continue
+            seen = self._configured[group] * min(float(difference[group].mean()), high**2)
+            noise = (1 - _LEARNING) * self._noise[group] + _LEARNING * seen
+            self._noise[group] = np.maximum(noise, low**2 * self._configured[group])
+        self._innovation = np.where(fresh, error, self._innovation)
+
+    def _find_lost(self, error: np.ndarray, variance: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+        """Entries that disagree once by too much, or by less for several ticks. Shape (nv,)."""
+        ratio = error / np.sqrt(variance + self._noise)
+        self._trend = np.where(fresh, (1 - _TREND) * self._trend + _TREND * ratio, self._trend)
+        of_noise = np.sqrt(_TREND / (2 - _TREND))  # standard deviation of such a mean of noise
+        lost = np.abs(ratio) > self._gate
+        lost |= np.abs(self._trend) > self._gate * of_noise
+        lost &= fresh
+        for group in _GROUPS[:3]:
+            lost[group] = lost[group].any() & fresh[group]
         self._trend[lost] = 0
         return lost

@@ -12,10 +12,15 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.sensor_filter import SensorFilter
+from xop_lerobot.retarget.stance import StanceMemory
 from xop_lerobot.retarget.sync_config import SyncConfig, SyncStatus
 from xop_lerobot.retarget.sync_contacts import make_contacts
 from xop_lerobot.retarget.sync_task import SyncTask
-from xop_lerobot.retarget.velocity_projection import ContactVelocity, project_velocity
+from xop_lerobot.retarget.velocity_projection import (
+    ContactVelocity,
+    compute_disagreement,
+    project_velocity,
+)
 from xop_lerobot.state import freeze
 
 logger = logging.getLogger(__name__)
@@ -51,6 +56,12 @@ class Synced:
 class StateSync:
     r"""Solves Eq. 4 each tick: the state the planner's simulator starts from.
 
+    1. The memory is carried to the present: the last state by its velocity.
+    2. Which contacts count (`StanceMemory`), and the velocity that they allow
+       (`velocity_projection`).
+    3. The measurement, averaged with what was carried over (`SensorFilter`).
+    4. Eq. 4 by SQP (`SyncTask`), each step by mink and DAQP within the joint limits.
+
     Args:
         morphology: The robot.
         model: Its planning model.
@@ -58,7 +69,7 @@ class StateSync:
 
     Attributes:
         failures: Number of ticks that fell back to the measurement since the last `reset`.
-        bounded: Number of steps for which DAQP was needed since the last `reset`.
+        num_qps: Number of steps for which DAQP was asked since the last `reset`.
     """
 
     def __init__(
@@ -69,6 +80,7 @@ class StateSync:
         wheeled = morphology.wheeled
         self.contacts = make_contacts(morphology, model, equilibrium=config.equilibrium)
         self.task = SyncTask(model, self.contacts, wheeled, config)
+        self.stance = StanceMemory(self.contacts, wheeled, config)
         self._contact_velocity = ContactVelocity(model, self.contacts, wheeled, config)
         self._configuration = mink.Configuration(model)
         self._limit = mink.ConfigurationLimit(model, gain=1.0)
@@ -78,29 +90,26 @@ class StateSync:
         self._limited_dofs = model.jnt_dofadr[limited]
         self._range = model.jnt_range[limited]
         scale = self.task.joint_scale
-        self._velocity_std = np.concatenate(
-            [[config.velocity] * 3, [config.gyro] * 3, config.joint_rate * scale]
+        self._velocity_variance = np.square(
+            np.concatenate(
+                [[config.velocity] * 3, [config.gyro] * 3, config.joint_rate * scale],
+            )
         )
-        position_std = np.concatenate(
-            [[config.position] * 3, [config.tilt] * 2, [config.heading], config.joint * scale]
-        )
-        self._filter = SensorFilter(model, position_std, self._velocity_std, config.gate)
-        self.failures = self.bounded = 0
+        self._filter = SensorFilter(model, 1 / self.task.cost, config.gate)
+        self.failures = self.num_qps = 0
         self.reset()
 
     def reset(self) -> None:
         """Forget the past: the robot may be anywhere now."""
-        self.failures = self.bounded = 0
+        self.failures = self.num_qps = 0
         self._last: Synced | None = None
         self._last_time = -np.inf
         self._forget()
 
     def _forget(self) -> None:
         self._filter.reset()
-        self._stance = np.full((len(self.contacts), 3), np.nan)
-        self._stance_age = np.zeros(len(self.contacts))
-        self._mode: Mode | None = None
-        self._active: tuple[int, ...] = ()
+        self.stance.reset()
+        self._is_new = True
 
     def synchronise(self, time: float, qpos: np.ndarray, qvel: np.ndarray, mode: Mode) -> Synced:
         """Find the state that measurement, contacts and memory agree on; never raises.
@@ -133,33 +142,39 @@ class StateSync:
         return Synced(freeze(qpos), freeze(qvel), 0.0, SyncStatus.MEASUREMENT, 0)
 
     def _solve(self, time: float, qpos: np.ndarray, qvel: np.ndarray, mode: Mode) -> Synced:
+        config, configuration = self.config, self._configuration
         dt = time - self._last_time
-        if not 0 < dt <= self.config.max_gap_s or not self.config.recursive:
+        if not (config.recursive and 0 < dt <= config.max_gap_s):
             self._forget()
-        measured, restarted = qpos, False
-        if self.config.recursive:
-            velocity = qvel if self._last is None else 0.5 * (self._last.qvel + qvel)
-            measured, restarted = self._filter.update(qpos, velocity, dt)
-        configuration = self._configuration
+        if self._is_new:
+            dt, guess = 0.0, qpos
+        else:
+            guess = self._last.qpos.copy()
+            mujoco.mj_integratePos(self.model, guess, self._last.qvel, dt)
+        configuration.update(guess)
+        self.stance.update_contacts(configuration.data, mode, dt)
+        velocity, variance = self._project(qvel)
+        mean = velocity if self._is_new else 0.5 * (velocity + self._last.qvel)
+        measured, restarted = self._filter.update(qpos, mean, variance, dt)
         configuration.update(measured)
-        if restarted or mode is not self._mode:
-            self._stance[:] = np.nan
-        self._activate(configuration.data, mode)
-        self.task.set_measurement(measured, self._filter.std if self.config.recursive else None)
-        self.task.set_active(self._active, self._stance)
+        if restarted:  # the guess was wrong, and with it all that came of it
+            self.stance.reset()
+            self.stance.update_contacts(configuration.data, mode, 0.0)
+            velocity, _ = self._project(qvel)
+        self.stance.remember(
+            self.task.compute_places(configuration.data), dt, self._filter.position_noise
+        )
+        self.task.set_measurement(measured, self._filter.std)
+        active = self.stance.active
+        self.task.set_active(active, self.stance.compute_std(), self.stance.places)
         iterations, bounded = self._descend()
-        if self.config.project_velocity:
-            jacobian, std = self._contact_velocity.compute_jacobian(
-                configuration.data, self._active
-            )
-            qvel = project_velocity(qvel, self._velocity_std, jacobian, std)
-        self._remember(time, mode)
-        errors = self.task.compute_contact_position_errors(configuration)
+        self._last_time, self._is_new = time, False
+        errors = self.task.compute_height_errors(configuration)
         status = SyncStatus.BOUNDED if bounded else SyncStatus.OK
         solution = configuration.data.qpos
         return Synced(
             qpos=freeze(solution),
-            qvel=freeze(qvel),
+            qvel=freeze(velocity),
             residual=float(np.sqrt(np.mean(np.square(errors)))) if errors.size else 0.0,
             status=SyncStatus.RESTARTED if restarted else status,
             iterations=iterations,
@@ -167,20 +182,34 @@ class StateSync:
             rotation=_compute_angle(solution[3:7], qpos[3:7]),
         )
 
-    def _activate(self, data: mujoco.MjData, mode: Mode) -> None:
-        """Find the contacts that count: all wheels, both feet, or the lower foot while mobile."""
-        everyone = tuple(range(len(self.contacts)))
-        if self.morphology.wheeled or mode is Mode.STATIONARY:
-            self._active = everyone
-        else:
-            heights = [
-                data.xpos[c.body][2] + data.xmat[c.body][6:9] @ c.point - c.height
-                for c in self.contacts
-            ]
-            self._active = (int(np.argmin(heights)),)
-        for index in everyone:
-            if index not in self._active:
-                self._stance[index] = np.nan
+    def _project(self, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project the velocity on the contacts that hold.
+
+        Returns:
+            Velocity and its variances. Shapes (nv,), (nv,).
+        """
+        variance = self._velocity_variance
+        if not self.config.project_velocity:
+            return qvel, variance
+        data, stance = self._configuration.data, self.stance
+        jacobians, variances = [], []
+        for index in stance.active:
+            jacobian = self._contact_velocity.compute_jacobian(data, index)
+            allowed = self._contact_velocity.compute_variance(index, stance.get_landing(index))
+            disagreement = compute_disagreement(qvel, variance, jacobian, allowed)
+            if disagreement > self.config.gate:  # it slips or swings
+                stance.release(index)
+                continue
+            jacobians.append(jacobian)
+            variances.append(allowed)
+        if jacobians and self.morphology.wheeled:
+            jacobians.append(self._contact_velocity.compute_level_jacobian(data))
+            variances.append(np.full(2, self.config.contact_rate**2))
+        if not jacobians:
+            return qvel, variance
+        return project_velocity(
+            qvel, variance, np.concatenate(jacobians), np.concatenate(variances)
+        )
 
     def _descend(self) -> tuple[int, bool]:
         """SQP from where the configuration is.
@@ -208,12 +237,10 @@ class StateSync:
         hessian.flat[:: len(hessian) + 1] += _DAMPING
         step = np.linalg.solve(hessian, error @ jacobian)
         reached = self._configuration.data.qpos[self._limited_qpos] + step[self._limited_dofs]
-        if not (
-            (reached < self._range[:, 0] - _BOUND_SLACK)
-            | (reached > self._range[:, 1] + _BOUND_SLACK)
-        ).any():
+        low, high = self._range[:, 0] - _BOUND_SLACK, self._range[:, 1] + _BOUND_SLACK
+        if not ((reached < low) | (reached > high)).any():
             return step, False
-        self.bounded += 1
+        self.num_qps += 1
         step = mink.solve_ik(
             self._configuration,
             [self.task],
@@ -223,22 +250,6 @@ class StateSync:
             limits=[self._limit],
         )
         return step, True
-
-    def _remember(self, time: float, mode: Mode) -> None:
-        """Take the synchronised feet into their mean place, forgetting what is long ago."""
-        dt = min(time - self._last_time, self.config.max_gap_s)
-        self._last_time, self._mode = time, mode
-        if self.morphology.wheeled or not self.config.recursive:
-            return
-        places = self.task.compute_places(self._configuration.data)
-        for index in self._active:
-            if np.isnan(self._stance[index, 0]):
-                self._stance[index], self._stance_age[index] = places[index], dt
-                continue
-            self._stance_age[index] = min(self._stance_age[index] + dt, self.config.memory_s)
-            change = places[index] - self._stance[index]
-            change[2] = np.arctan2(np.sin(change[2]), np.cos(change[2]))
-            self._stance[index] += dt / self._stance_age[index] * change
 
 
 def _compute_angle(a: np.ndarray, b: np.ndarray) -> float:

@@ -39,10 +39,18 @@ class SyncConfig:
         joint_rate: Measured joint velocity [rad/s], a tenth in m/s on sliding joints.
         contact_height: Height of a contact point over its equilibrium [m].
         contact_tilt: Tilt of a foot over the ground, or of an axle [rad].
-        stance_position: Remembered place of a standing foot [m].
-        stance_heading: Remembered heading of a standing foot [rad].
+        stance_position: Remembered place of a standing foot, at best [m].
+        stance_heading: Remembered heading of a standing foot, at best [rad].
         contact_velocity: Velocity of a point in contact [m/s].
         contact_rate: Angular velocity of a standing foot, roll and pitch rate on wheels [rad/s].
+        touchdown_s: Time in which a foot that has just touched down comes to rest [s].
+        touchdown_height: Height of a foot that touches down, over its equilibrium [m].
+        touchdown_tilt: Its tilt [rad].
+        touchdown_velocity: Its velocity [m/s].
+        touchdown_rate: Its angular velocity [rad/s].
+        lift_height: Height over the lowest foot at which a foot is off the ground [m].
+        lost_height: Height over or under the ground, as measured, at which no contact counts [m].
+        lost_tilt: Tilt of a foot, or of an axle, at which its contact does not count [rad].
         memory_s: Time over which the place of a standing foot is averaged [s].
         gate: Disagreement of measurement and memory at which the memory is begun anew, in
             standard deviations [1].
@@ -64,11 +72,19 @@ class SyncConfig:
     gyro: float = 0.02
     joint_rate: float = 0.1
     contact_height: float = 0.0005
-    contact_tilt: float = 0.002
-    stance_position: float = 0.001
+    contact_tilt: float = 0.005
+    stance_position: float = 0.0015
     stance_heading: float = 0.003
-    contact_velocity: float = 0.005
+    contact_velocity: float = 0.01
     contact_rate: float = 0.02
+    touchdown_s: float = 0.02
+    touchdown_height: float = 0.01
+    touchdown_tilt: float = 0.06
+    touchdown_velocity: float = 0.5
+    touchdown_rate: float = 4.0
+    lift_height: float = 0.025
+    lost_height: float = 0.1
+    lost_tilt: float = 0.35
     memory_s: float = 2.0
     gate: float = 4.0
     max_gap_s: float = 0.2

@@ -98,6 +98,12 @@ def make_contacts(
     return tuple(contacts)
 
 
+def compute_height(contact: Contact, data: mujoco.MjData) -> float:
+    """Height of a contact over its equilibrium, kinematics up to date [m]."""
+    body = contact.body
+    return float(data.xpos[body, 2] + data.xmat[body, 6:9] @ contact.point - contact.height)
+
+
 def compute_equilibrium(
     model: mujoco.MjModel, qpos: np.ndarray, iterations: int = 50
 ) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import mink
@@ -9,8 +10,8 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.retarget.sync_config import SyncConfig
-from xop_lerobot.retarget.sync_contacts import Contact
-from xop_lerobot.transforms import quat_conjugate, quat_log, quat_multiply, wrap_angle
+from xop_lerobot.retarget.sync_contacts import Contact, compute_height
+from xop_lerobot.transforms import quat_conjugate, quat_log, quat_multiply
 
 
 class SyncTask(mink.Task):
@@ -32,9 +33,8 @@ class SyncTask(mink.Task):
     wheel, axle           :math:`e_z^\top R R_{c,i} e_y`                 1 a wheel 1
     ===================== ============================================== ========= ============
 
-    Heading is an addition: the paper knows where a foot stands but not where it points. A foot
-    whose place is not known yet has its height and flatness alone. Angles are of the tangent
-    space of MuJoCo's free joint: linear in the world, angular in the body.
+    Heading is an addition: the paper knows where a foot stands but not where it points. Steps
+    are in the tangent space of MuJoCo's free joint: linear in the world, angular in the body.
 
     One task instead of mink's stock ones: rows that never change are filled once, and one pass
     over the contacts gives residual and Jacobian.
@@ -66,7 +66,7 @@ class SyncTask(mink.Task):
         self._active: tuple[int, ...] = ()
         self._measured = model.qpos0.copy()
         self._rotation = np.empty(9)
-        self._stance = np.full((len(self.contacts), 3), np.nan)
+        self._stance = np.zeros((len(self.contacts), 3))
         slides = model.jnt_type[model.dof_jntid[6:]] == mujoco.mjtJoint.mjJNT_SLIDE
         self.joint_scale = np.where(slides, 0.1, 1.0)
         """Noise of each joint over that of a hinge. Shape (nv - 6,)."""
@@ -86,29 +86,19 @@ class SyncTask(mink.Task):
         self._measured = qpos
         self._own_cost = self._base_cost if std is None else 1 / std
 
-    def set_active(self, active: Sequence[int], stance: np.ndarray) -> None:
-        """Set which contacts count, and where they stand.
+    def set_active(
+        self, active: Sequence[int], std: Sequence[np.ndarray], stance: np.ndarray
+    ) -> None:
+        """Set which contacts count, how much, and where they stand.
 
         Args:
             active: Indices of contacts.
-            stance: x, y and heading of every contact, NaN where not known. Shape (contacts, 3).
+            std: Standard deviation of each row of each of them; infinite for none. Shapes (7,)
+                for a foot, (2,) for a wheel.
+            stance: x, y and heading of every contact. Shape (contacts, 3).
         """
         self._active, self._stance = tuple(active), stance
-        config = self.config
-        if self.wheeled:
-            one = np.array([1 / config.contact_height, 1 / config.contact_tilt])
-        else:
-            flat = 1 / config.contact_tilt
-            place, heading = 1 / config.stance_position, 1 / config.stance_heading
-            one = np.array([place, place, 1 / config.contact_height, flat, flat, flat, heading])
-        costs = []
-        for index in self._active:
-            cost = one
-            if not self.wheeled and np.isnan(stance[index, 0]):
-                cost = one.copy()
-                cost[[0, 1, 6]] = 0
-            costs.append(cost)
-        self.cost = np.concatenate([self._own_cost, *costs])
+        self.cost = np.concatenate([self._own_cost, *(1 / one for one in std)])
 
     def compute_error(self, configuration: mink.Configuration) -> np.ndarray:
         """Compute all residuals, without weights. Shape (rows,)."""
@@ -132,14 +122,10 @@ class SyncTask(mink.Task):
             0.0,
         )
 
-    def compute_contact_position_errors(self, configuration: mink.Configuration) -> np.ndarray:
-        """Position residuals of the active contacts [m], rows without a target left out."""
-        self._evaluate(configuration.data)
-        start, size = self._num_own, self._per_contact
-        errors = self._error[start : start + size * len(self._active)].reshape(-1, size)
-        costs = self.cost[start:].reshape(-1, size)
-        positions = errors[:, : 1 if self.wheeled else 3]
-        return positions[costs[:, : positions.shape[1]] > 0]
+    def compute_height_errors(self, configuration: mink.Configuration) -> np.ndarray:
+        """Height of each active contact over its equilibrium [m]. Shape (active,)."""
+        data = configuration.data
+        return np.array([compute_height(self.contacts[i], data) for i in self._active])
 
     def compute_places(self, data: mujoco.MjData) -> np.ndarray:
         """Compute x, y [m] and heading [rad] of every contact. Shape (contacts, 3)."""
@@ -172,10 +158,9 @@ class SyncTask(mink.Task):
         rotation = data.xmat[contact.body].reshape(3, 3)
         point = data.xpos[contact.body] + rotation @ contact.point
         mujoco.mj_jac(self.model, data, self._jacp, self._jacr, point, contact.body)
-        x, y, heading = self._stance[index]
-        known = x == x  # noqa: PLR0124 not NaN
-        error[row : row + 3] = point
-        error[row + 2] -= contact.height
+        stance = self._stance[index]
+        error[row : row + 2] = point[:2] - stance[:2]
+        error[row + 2] = point[2] - contact.height
         jacobian[row : row + 3] = self._jacp
         up, forward = rotation @ contact.axis, rotation @ contact.forward
         error[row + 3 : row + 6] = up
@@ -185,12 +170,7 @@ class SyncTask(mink.Task):
         length = forward[0] ** 2 + forward[1] ** 2
         turn = np.array([-forward[0] * forward[2], -forward[1] * forward[2], length]) / length
         jacobian[row + 6] = turn @ self._jacr
-        if known:
-            error[row] -= x
-            error[row + 1] -= y
-            error[row + 6] = wrap_angle(np.arctan2(forward[1], forward[0]) - heading)
-        else:
-            error[row] = error[row + 1] = error[row + 6] = 0
+        error[row + 6] = _wrap(math.atan2(forward[1], forward[0]) - stance[2])
 
     def _evaluate_wheel(self, data: mujoco.MjData, index: int, row: int) -> None:
         contact, error, jacobian = self.contacts[index], self._error, self._jacobian
@@ -201,6 +181,11 @@ class SyncTask(mink.Task):
         error[row], error[row + 1] = point[2] - contact.height, axle[2]
         jacobian[row] = self._jacp[2]
         jacobian[row + 1] = axle[1] * self._jacr[0] - axle[0] * self._jacr[1]  # (w x axle)_z
+
+
+def _wrap(angle: float) -> float:
+    """Wrap to [-pi, pi) [rad]."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def _skew(v: np.ndarray) -> np.ndarray:

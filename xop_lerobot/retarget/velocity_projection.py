@@ -12,8 +12,8 @@ from xop_lerobot.retarget.sync_contacts import Contact
 
 
 def project_velocity(
-    qvel: np.ndarray, std: np.ndarray, jacobian: np.ndarray, constraint_std: np.ndarray
-) -> np.ndarray:
+    qvel: np.ndarray, variance: np.ndarray, jacobian: np.ndarray, constraint: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     r"""Find the likeliest velocity under the soft constraint :math:`J v \approx 0`.
 
     .. math::
@@ -22,27 +22,45 @@ def project_velocity(
         \rVert^2_{R^{-1}}
         \quad\Rightarrow\quad v = \tilde v - S J^\top (J S J^\top + R)^{-1} J \tilde v
 
-    with :math:`S = diag(std^2)`, :math:`R = diag(constraint\_std^2)`: the update of a Kalman
-    filter whose measurement is "the contact does not move" (Hartley et al., Contact-aided
-    invariant extended Kalman filtering, RSS 2018, have the same for the base). One linear solve
-    of the size of the constraint.
+    with S and R diagonal: the update of a Kalman filter whose measurement is "the contact does
+    not move" (Hartley et al., Contact-aided invariant extended Kalman filtering, RSS 2018, have
+    the same for the base). One linear solve of the size of the constraint.
 
     Args:
-        qvel: Measured velocity ṽ. Shape (nv,).
-        std: Its standard deviations. Shape (nv,).
+        qvel: Measured velocity ṽ [m/s, rad/s]. Shape (nv,).
+        variance: Diagonal of S. Shape (nv,).
         jacobian: J. Shape (m, nv).
-        constraint_std: Standard deviation of each row of J v [unit of the row]. Shape (m,).
+        constraint: Diagonal of R, variance of each row of J v. Shape (m,).
 
     Returns:
-        The projected velocity. Shape (nv,).
+        The projected velocity (nv,), and its variances (nv,).
 
     Raises:
         numpy.linalg.LinAlgError: If the solve is singular.
     """
-    spread = np.square(std)[:, None] * jacobian.T  # S J^T  (nv, m)
+    if not len(jacobian):
+        return qvel, variance
+    spread = variance[:, None] * jacobian.T  # S J^T  (nv, m)
     total = jacobian @ spread
-    total.flat[:: len(total) + 1] += np.square(constraint_std)
-    return qvel - spread @ np.linalg.solve(total, jacobian @ qvel)
+    total.flat[:: len(total) + 1] += constraint
+    gain = np.linalg.solve(total, spread.T)  # (m, nv)
+    left = np.maximum(variance - np.einsum("ij,ji->i", spread, gain), 1e-12)
+    return qvel - (jacobian @ qvel) @ gain, left
+
+
+def compute_disagreement(
+    qvel: np.ndarray, variance: np.ndarray, jacobian: np.ndarray, constraint: np.ndarray
+) -> float:
+    r"""How badly a measured velocity fits a contact: 1 on average if it holds.
+
+    .. math:: \tfrac1m (J \tilde v)^\top (J S J^\top + R)^{-1} J \tilde v
+
+    Arguments are those of `project_velocity`.
+    """
+    total = (jacobian * variance) @ jacobian.T
+    total.flat[:: len(total) + 1] += constraint
+    slip = jacobian @ qvel
+    return float(slip @ np.linalg.solve(total, slip)) / len(slip)
 
 
 class ContactVelocity:
@@ -70,45 +88,40 @@ class ContactVelocity:
         self.config = config
         self._base = int(model.jnt_bodyid[0])
 
-    def compute_jacobian(
-        self, data: mujoco.MjData, active: Sequence[int]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute J and the standard deviation of each row, kinematics up to date.
+    def compute_jacobian(self, data: mujoco.MjData, index: int) -> np.ndarray:
+        """Compute J of one contact, kinematics up to date. Shape (m, nv)."""
+        contact = self.contacts[index]
+        rotation = data.xmat[contact.body].reshape(3, 3)
+        point = data.xpos[contact.body] + rotation @ contact.point
+        if contact.rolls:
+            point[2] -= contact.radius
+        jacobian = np.empty((6, self.model.nv))
+        mujoco.mj_jac(self.model, data, jacobian[:3], jacobian[3:], point, contact.body)
+        if not self.wheeled:
+            return jacobian
+        if contact.rolls:
+            return jacobian[:3]
+        return np.stack([(rotation @ contact.axis) @ jacobian[:3], jacobian[2]])
+
+    def compute_variance(self, index: int, landing: float) -> np.ndarray:
+        """Variance of each row of J v of one contact.
 
         Args:
-            data: Pose of the robot.
-            active: Indices of the contacts that hold.
+            index: Which contact.
+            landing: How much of a touch-down is left in it, 0 to 1.
 
         Returns:
-            Jacobian (m, nv) and standard deviations (m,).
+            Shape (m,).
         """
-        if not active:
-            return np.zeros((0, self.model.nv)), np.zeros(0)
-        velocity, rate = self.config.contact_velocity, self.config.contact_rate
-        jacobian = np.zeros((6 * len(active) + 3, self.model.nv))
-        std = np.full(len(jacobian), velocity)
-        row = 0
-        jacp, jacr = np.zeros((2, 3, self.model.nv))
-        for index in active:
-            contact = self.contacts[index]
-            rotation = data.xmat[contact.body].reshape(3, 3)
-            point = data.xpos[contact.body] + rotation @ contact.point
-            if contact.rolls:
-                point[2] -= contact.radius
-            mujoco.mj_jac(self.model, data, jacp, jacr, point, contact.body)
-            if not self.wheeled:
-                jacobian[row : row + 3], jacobian[row + 3 : row + 6] = jacp, jacr
-                std[row + 3 : row + 6] = rate
-                row += 6
-            elif contact.rolls:
-                jacobian[row : row + 3] = jacp
-                row += 3
-            else:
-                jacobian[row], jacobian[row + 1] = (rotation @ contact.axis) @ jacp, jacp[2]
-                row += 2
+        config = self.config
+        linear = config.contact_velocity**2 + (landing * config.touchdown_velocity) ** 2
         if self.wheeled:
-            mujoco.mj_jacBody(self.model, data, None, jacr, self._base)
-            jacobian[row : row + 2] = jacr[:2]
-            std[row : row + 2] = rate
-            row += 2
-        return jacobian[:row], std[:row]
+            return np.full(3 if self.contacts[index].rolls else 2, linear)
+        angular = config.contact_rate**2 + (landing * config.touchdown_rate) ** 2
+        return np.array([linear] * 3 + [angular] * 3)
+
+    def compute_level_jacobian(self, data: mujoco.MjData) -> np.ndarray:
+        """Compute J of the roll and pitch rate of a base on wheels, world axes. Shape (2, nv)."""
+        jacobian = np.empty((3, self.model.nv))
+        mujoco.mj_jacBody(self.model, data, None, jacobian, self._base)
+        return jacobian[:2]

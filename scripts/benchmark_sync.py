@@ -1,0 +1,203 @@
+"""How much better does the planner predict from a synchronised state than from a raw measurement?
+
+A robot stands, walks or drives in the simulated plant under noisy sensors. At every tick each way
+of synchronising gets the same measurement. At every tenth tick the planner's prediction (planning
+model, low-level policy with the plant's memory) is started from the state each gives, and from
+the true one; printed is by how much the predicted displacements of the base differ after 60 and
+200 ms, and how far the states themselves are from the truth.
+
+    python scripts/benchmark_sync.py --seeds 5 --duration 12 --noise mild
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+import xop_lerobot.low_level.falcon  # noqa: F401 registers the policy
+from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.low_level.policy import LowLevelPolicy, make_policy
+from xop_lerobot.morphology.morphology import Morphology, make_morphology
+from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.plant.simulation import Simulation, SimulationConfig
+from xop_lerobot.retarget.rollout import PolicyRollout
+from xop_lerobot.retarget.state_sync import StateSync
+from xop_lerobot.retarget.sync_config import SyncConfig
+from xop_lerobot.state import RobotState
+from xop_lerobot.transforms import quat_yaw, wrap_angle
+
+TICK = 0.04  # of the teleoperator [s]
+HORIZONS = (3, 10)  # 60 and 200 ms [control steps]
+EVERY = 10  # ticks between predictions
+SETTLE_S = 2.0  # not counted: transients of robot and filters
+
+VARIANTS = {
+    "NLS": SyncConfig(recursive=False, project_velocity=False),
+    "NLS, contact at z = 0": SyncConfig(recursive=False, project_velocity=False, equilibrium=False),
+    "NLS + velocity": SyncConfig(recursive=False),
+    "NLS + velocity + memory": SyncConfig(),
+}
+"""Ways to synchronise; raw is the measurement as it is."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot that does something.
+
+    Attributes:
+        robot: Its name.
+        mode: Mode it is in.
+        command: Entries of the command that are not neutral [their unit].
+    """
+
+    robot: str
+    mode: Mode
+    command: dict[str, float]
+
+
+CASES = {
+    "g1 stands": Case("g1", Mode.STATIONARY, {}),
+    "g1 squats": Case("g1", Mode.STATIONARY, {"height": -0.1, "waist_yaw": 0.3}),
+    "g1 walks": Case("g1", Mode.MOBILE, {"vx": 0.4, "yaw_rate": 0.2}),
+    "rby1 stands": Case("rby1", Mode.STATIONARY, {}),
+    "rby1 drives": Case("rby1", Mode.MOBILE, {"v": 0.4, "yaw_rate": 0.3}),
+}
+
+
+@dataclass
+class Errors:
+    """What one way of synchronising got wrong: one entry per tick or per prediction."""
+
+    position: list[float] = field(default_factory=list)  # of the base [m]
+    height: list[float] = field(default_factory=list)  # of the base [m]
+    heading: list[float] = field(default_factory=list)  # [rad]
+    tilt: list[float] = field(default_factory=list)  # [rad]
+    velocity: list[float] = field(default_factory=list)  # of the base [m/s]
+    joints: list[float] = field(default_factory=list)  # root mean square over joints [rad]
+    predicted: dict[int, list[float]] = field(default_factory=lambda: {h: [] for h in HORIZONS})
+    seconds: list[float] = field(default_factory=list)  # per solve [s]
+
+    def add_state(self, state: RobotState, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Compare a state with the truth."""
+        truth = state.true_qpos
+        self.position.append(float(np.linalg.norm(qpos[:3] - truth[:3])))
+        self.height.append(float(qpos[2] - truth[2]))
+        self.heading.append(float(wrap_angle(quat_yaw(qpos[3:7]) - quat_yaw(truth[3:7]))))
+        up, true_up = _compute_up(qpos[3:7]), _compute_up(truth[3:7])
+        self.tilt.append(float(np.linalg.norm(up - true_up)))
+        self.velocity.append(float(np.linalg.norm(qvel[:3] - state.true_qvel[:3])))
+        self.joints.append(float(np.sqrt(np.mean(np.square(qpos[7:] - truth[7:])))))
+
+
+def run(case: Case, noise: str, seed: int, duration: float, errors: dict[str, Errors]) -> None:
+    """Run one episode and add its errors."""
+    morphology = make_morphology(case.robot)
+    policy = make_policy(morphology.policies[0])
+    model = build_model(morphology, "planning")
+    loop = PolicyLoop(morphology, Simulation(morphology, SimulationConfig(noise=noise)), policy)
+    loop.reset(seed)
+    rollout = PolicyRollout(model, policy, 1)
+    syncs = {name: StateSync(morphology, model, config) for name, config in VARIANTS.items()}
+    for tick in range(round(duration / TICK)):
+        action = _make_action(morphology, case, tick * TICK)
+        loop.execute(action, TICK)
+        state = loop.state
+        states = {"raw": (state.qpos, state.qvel)}
+        for name, sync in syncs.items():
+            start = time.perf_counter()
+            synced = sync.synchronise(state.time, state.qpos, state.qvel, case.mode)
+            errors[name].seconds.append(time.perf_counter() - start)
+            states[name] = (synced.qpos, synced.qvel)
+        if tick * TICK < SETTLE_S:
+            continue
+        for name, (qpos, qvel) in states.items():
+            errors[name].add_state(state, qpos, qvel)
+        if tick % EVERY == 0:
+            true = _predict(rollout, state, loop.action, state.true_qpos, state.true_qvel)
+            for name, (qpos, qvel) in states.items():
+                moved = _predict(rollout, state, loop.action, qpos, qvel)
+                for horizon in HORIZONS:
+                    error = float(np.linalg.norm(moved[horizon] - true[horizon]))
+                    errors[name].predicted[horizon].append(error)
+    rollout.close()
+    loop.close()
+
+
+def _make_action(morphology: Morphology, case: Case, time_s: float) -> RobotAction:
+    """The case's command, taken back and forth every 4 s where it is about posture."""
+    action = morphology.rest_action()
+    space = morphology.command_space
+    for name, value in case.command.items():
+        index = space.names.index(name)
+        moves = bool(space.mobile_only[index])
+        action.command[index] += value if moves or time_s % 4 < 2 else 0.0  # noqa: PLR2004
+    return RobotAction(action.command, case.mode, action.arms)
+
+
+def _predict(
+    rollout: PolicyRollout,
+    state: RobotState,
+    action: RobotAction,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+) -> np.ndarray:
+    """Predicted displacement of the base from its start [m]. Shape (H + 1, 3)."""
+    commands = np.broadcast_to(action.command, (1, max(HORIZONS), len(action.command)))
+    predicted = rollout.predict(qpos, qvel, state.memory, commands, action.arms, action.mode)
+    return predicted.qpos[0, :, :3] - qpos[:3]
+
+
+def _compute_up(quat: np.ndarray) -> np.ndarray:
+    """World's vertical in the body [1]. Shape (3,)."""
+    w, x, y, z = quat
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else float("nan")
+
+
+def print_table(title: str, errors: dict[str, Errors]) -> None:
+    """Print one case."""
+    count = len(errors["raw"].predicted[HORIZONS[0]])
+    print(f"\n{title}: {count} predictions, {len(errors['raw'].position)} states; RMS")
+    print(
+        f"{'state given to the planner':28s} {'60 ms':>7s} {'200 ms':>7s} | {'p':>6s} {'z':>6s} "
+        f"{'v':>7s} {'heading':>8s} {'tilt':>6s} {'joints':>7s} | solve"
+    )
+    units = ("mm", "mm", "mm", "mm", "mm/s", "mrad", "mrad", "mrad", "ms")
+    print(f"{'':28s} {units[0]:>7s} {units[1]:>7s} | {units[2]:>6s} {units[3]:>6s} "
+          f"{units[4]:>7s} {units[5]:>8s} {units[6]:>6s} {units[7]:>7s} | {units[8]}")  # fmt: skip
+    for name, error in errors.items():
+        short, long = (1e3 * _rms(error.predicted[horizon]) for horizon in HORIZONS)
+        solve = f"{1e3 * np.median(error.seconds):.2f}" if error.seconds else "-"
+        print(
+            f"{name:28s} {short:7.2f} {long:7.2f} | {1e3 * _rms(error.position):6.2f} "
+            f"{1e3 * _rms(error.height):6.2f} {1e3 * _rms(error.velocity):7.1f} "
+            f"{1e3 * _rms(error.heading):8.2f} {1e3 * _rms(error.tilt):6.2f} "
+            f"{1e3 * _rms(error.joints):7.2f} | {solve}"
+        )
+
+
+def main() -> None:
+    """Run the cases and print their tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--noise", default="mild", help="noise preset of the sensors")
+    parser.add_argument("--seeds", type=int, default=3, help="episodes per case, seeds 0, 1, …")
+    parser.add_argument("--duration", type=float, default=12.0, help="of an episode [s]")
+    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
+    args = parser.parse_args()
+    print(f"noise {args.noise}, seeds 0 to {args.seeds - 1}, {args.duration} s each")
+    for name in args.cases:
+        errors = {variant: Errors() for variant in ("raw", *VARIANTS)}
+        for seed in range(args.seeds):
+            run(CASES[name], args.noise, seed, args.duration, errors)
+        print_table(name, errors)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""Which feet or wheels stand on the ground, since when, and where."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.retarget.sync_config import SyncConfig
+from xop_lerobot.retarget.sync_contacts import Contact, compute_height
+
+
+class StanceMemory:
+    r"""The active set C of Eq. 4 and the known stance locations :math:`p^{world}_{c,i}`.
+
+    C holds all wheels; both feet while stationary; the lower foot while mobile. A foot that is
+    lifted, and any contact that is tilted or far from the ground (the robot fell or was lifted),
+    does not count.
+
+    The place of a foot is the mean of where the filtered measurement has seen it since it came
+    to stand, forgetting with `memory_s`:
+
+    .. math::
+
+        \hat p \leftarrow \hat p + \frac{\Delta t}{\min(T, T_{mem})} (p_c(\tilde x) - \hat p),
+        \qquad \sigma^2 = \sigma_{best}^2 + \sigma_p^2\,\frac{\Delta t}{T}
+
+    with T the time it stands. A foot that slips or lifts begins anew; one that creeps is followed
+    within the memory. A foot that has just touched down is not at rest yet: `get_landing` decays
+    from 1 with `touchdown_s`, and loosens its residuals.
+
+    Args:
+        contacts: The robot's feet or wheels.
+        wheeled: Whether they are wheels; wheels have no place.
+        config: Times and tolerances.
+    """
+
+    def __init__(self, contacts: Sequence[Contact], wheeled: bool, config: SyncConfig) -> None:
+        self.contacts, self.wheeled, self.config = tuple(contacts), wheeled, config
+        self.places = np.zeros((len(self.contacts), 3))
+        """x, y [m] and heading [rad] of every foot in the world. Shape (contacts, 3)."""
+        self.active: tuple[int, ...] = ()
+        """Contacts that count now."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget where anything stands; what stands now has not just landed."""
+        self.active = ()
+        self._stood = [0.0] * len(self.contacts)  # time in the mean [s]
+        self._landed = [math.inf] * len(self.contacts)  # time since the touch-down [s]
+        self._spread = [(math.inf, math.inf)] * len(self.contacts)
+        self._is_new = True
+
+    def release(self, index: int) -> None:
+        """Forget where a contact stood, because it moves."""
+        self._stood[index], self._landed[index] = 0.0, 0.0
+
+    def get_landing(self, index: int) -> float:
+        """How much of its touch-down is left in a contact, 1 at first, then falling to 0."""
+        if self.wheeled:
+            return 0.0
+        return math.exp(-self._landed[index] / self.config.touchdown_s)
+
+    def update_contacts(self, data: mujoco.MjData, mode: Mode, dt: float) -> None:
+        """Find what stands on the ground.
+
+        Args:
+            data: Pose of the robot, kinematics up to date.
+            mode: Mode of the robot.
+            dt: Time since the last update [s].
+        """
+        heights = [compute_height(contact, data) for contact in self.contacts]
+        lowest = min(range(len(heights)), key=heights.__getitem__)
+        active = []
+        for index, contact in enumerate(self.contacts):
+            raised = heights[index] - heights[lowest] > self.config.lift_height
+            if not self.wheeled:
+                raised |= mode is Mode.MOBILE and index != lowest
+            if raised or not self._is_near_ground(contact, heights[index], data):
+                self.release(index)
+                continue
+            active.append(index)
+            if not self._is_new and index not in self.active:
+                self.release(index)
+            else:
+                self._landed[index] += dt
+        self.active, self._is_new = tuple(active), False
+
+    def _is_near_ground(self, contact: Contact, height: float, data: mujoco.MjData) -> bool:
+        upright = float(data.xmat[contact.body, 6:9] @ contact.axis)  # cosine to the vertical
+        tilt = (
+            abs(math.asin(max(-1.0, min(1.0, upright))))
+            if self.wheeled
+            else math.acos(max(-1.0, min(1.0, upright)))
+        )
+        return abs(height) < self.config.lost_height and tilt < self.config.lost_tilt
+
+    def remember(self, places: np.ndarray, dt: float, noise: float) -> None:
+        """Take the feet of the filtered measurement into the mean of their places.
+
+        Args:
+            places: x, y [m] and heading [rad] of every contact. Shape (contacts, 3).
+            dt: Time since the last one [s].
+            noise: Standard deviation of a measured position [m].
+        """
+        for index in self.active:
+            stood = self._stood[index]
+            if stood == 0:
+                self.places[index] = places[index]
+            self._stood[index] = stood = min(stood + dt, self.config.memory_s)
+            share = dt / stood if stood else 1.0
+            change = places[index] - self.places[index]
+            change[2] = math.remainder(change[2], 2 * math.pi)
+            self.places[index] += share * change
+            config = self.config
+            # Headings of feet and base are as noisy to each other as places and position.
+            self._spread[index] = (
+                math.hypot(config.stance_position, noise * math.sqrt(share)),
+                math.hypot(
+                    config.stance_heading,
+                    config.heading * noise / config.position * math.sqrt(share),
+                ),
+            )
+
+    def compute_std(self) -> list[np.ndarray]:
+        """Standard deviations of the residuals of each active contact; see `SyncTask`."""
+        config, rows = self.config, []
+        for index in self.active:
+            landing = self.get_landing(index)
+            height = config.contact_height + landing * config.touchdown_height
+            tilt = config.contact_tilt + landing * config.touchdown_tilt
+            if self.wheeled:
+                rows.append(np.array([height, tilt]))
+                continue
+            place, heading = self._spread[index]
+            rows.append(np.array([place, place, height, tilt, tilt, tilt, heading]))
+        return rows
