@@ -20,8 +20,10 @@ from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, GoalTrack, Scen
 from xop_lerobot.evaluation.tracking_setup import (
     TrackingSetup,
     compute_physics_steps,
+    get_ablation,
     make_retargeter_config,
     make_tuned_morphology,
+    resolve_configs,
 )
 from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.policy import make_policy
@@ -274,14 +276,16 @@ def make_record(
     """Put the figures of a run and what it ran with in one place, fit for JSON."""
     scenario = get_scenario(setup.scenario)
     metrics = compute_metrics(track, trajectory, scenario.get_tolerance(setup.robot))
-    config = make_tuned_morphology(setup).mpc_config(scenario.mode)
+    config = resolve_configs(setup)[scenario.mode]
+    retargeter = make_retargeter_config(setup, seed)
     return {
         "robot": setup.robot,
         "scenario": setup.scenario,
         "ablation": setup.ablation,
         "noise": setup.resolved_noise,
-        "sync": setup.sync,
-        "preset": setup.preset,
+        "retargeter": retargeter.type,
+        "sync": retargeter.sync,
+        "preset": get_ablation(setup.ablation).preset or setup.preset,
         "seed": seed,
         "hold": setup.hold,
         "samples": config.num_samples,

@@ -16,10 +16,16 @@ from xop_lerobot.evaluation.tracking_report import (
     read_runs,
 )
 from xop_lerobot.evaluation.tracking_scenarios import SCENARIO_GROUPS
-from xop_lerobot.evaluation.tracking_setup import ABLATIONS
+from xop_lerobot.evaluation.tracking_setup import ABLATIONS, SYNC_VARIANTS
 
 DOCUMENT = Path("docs/benchmarks.md")
 ROBOTS = ("g1", "rby1")
+LEADS = {
+    name: ablation
+    for name, ablation in ABLATIONS.items()
+    if name not in SYNC_VARIANTS or name == "default"
+}
+"""Variants of the retargeter itself."""
 
 
 def write_documents(root: Path, results: Path) -> list[Path]:
@@ -59,8 +65,9 @@ def make_blocks(runs: Mapping[str, Run], machine: Mapping[str, Any]) -> dict[str
             names = SCENARIO_GROUPS[kind]
             chosen = [run for run in own.values() if run["scenario"] in names]
             if len({run["ablation"] for run in chosen}) > 1:
-                blocks[f"{robot} {kind} ablations"] = make_ablation_table(
-                    own, robot, names, ABLATIONS
+                blocks[f"{robot} {kind} ablations"] = make_ablation_table(own, robot, names, LEADS)
+                blocks[f"{robot} {kind} sync"] = make_ablation_table(
+                    own, robot, names, {name: ABLATIONS[name] for name in SYNC_VARIANTS}
                 )
     return blocks
 

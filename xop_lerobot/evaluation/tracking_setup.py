@@ -14,6 +14,18 @@ from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
+from xop_lerobot.retarget.presets import build_configs
+
+
+@dataclass(frozen=True)
+class Without:
+    """An override that takes one entry out of a list.
+
+    Attributes:
+        entry: What is taken out.
+    """
+
+    entry: str
 
 
 @dataclass(frozen=True)
@@ -23,14 +35,16 @@ class Ablation:
     Attributes:
         title: What differs from the default, for tables.
         mpc: Overrides of `MpcConfig` by name, see `override_config`.
+        preset: Preset that the variant begins with, None for the one that was asked for.
         retargeter: Settings of `RetargeterConfig`.
         noise: Preset of the sensors' noise, None for the one that was asked for.
         equal_compute: Whether the number of samples is raised or lowered so that as many physics
-            steps per second are rolled out as by the default.
+            steps per second are rolled out as without the ablation.
     """
 
     title: str
     mpc: Mapping[str, Any] = field(default_factory=dict)
+    preset: str | None = None
     retargeter: Mapping[str, Any] = field(default_factory=dict)
     noise: str | None = None
     equal_compute: bool = False
@@ -38,14 +52,42 @@ class Ablation:
 
 ABLATIONS: dict[str, Ablation] = {
     "default": Ablation("the default preset"),
+    "table1": Ablation("our Table I, its own numbers", preset="table1"),
+    "table1_equal": Ablation("our Table I, equal compute", preset="table1", equal_compute=True),
     "no_extrapolation": Ablation("no extrapolated terminal state", {"extrapolation_s": 0.0}),
+    "no_hold_kernel": Ablation("kernel of zero mean", {"kernel_mean": "zero"}),
+    "no_time_shift": Ablation("one control step of shift", {"shift": "one"}),
+    "no_proposal": Ablation(
+        "no kinematic proposal",
+        {"candidates": Without("proposal"), "control_reference": "neutral"},
+    ),
+    "no_candidates": Ablation(
+        "no fixed candidates", {"candidates": (), "control_reference": "neutral"}
+    ),
     "no_preview": Ablation("no goal preview", {"preview_s": 0.0}),
+    "no_drift": Ablation("no drift observer", {"observe_drift": False}),
     "no_ess": Ablation("raw weights, λ = 0.001", {"weighting": "raw", "temperature": 0.001}),
     "minmax": Ablation("min-max weights, λ = 0.05", {"weighting": "minmax", "temperature": 0.05}),
+    "gaussian": Ablation("Gaussian samples", {"sampling": "gaussian"}),
+    "sobol": Ablation("Sobol samples", {"sampling": "sobol"}),
+    "raw_noise": Ablation(
+        "Gaussian samples, full width at the goal too", {"sampling": "gaussian", "min_noise": 1.0}
+    ),
+    "no_sync": Ablation("no state synchronisation", retargeter={"sync": False}),
     "exact": Ablation("no sensor noise", noise="off"),
+    "exact_no_sync": Ablation(
+        "no sensor noise, no synchronisation", retargeter={"sync": False}, noise="off"
+    ),
+    "harsh": Ablation("harsh sensor noise", noise="harsh"),
+    "harsh_no_sync": Ablation(
+        "harsh sensor noise, no synchronisation", retargeter={"sync": False}, noise="harsh"
+    ),
     "direct": Ablation("direct mapping", retargeter={"type": "direct"}),
 }
-"""Variants by name: each is the default preset but for what is named."""
+"""Variants by name: each is the preset that was asked for, but for what is named."""
+
+SYNC_VARIANTS = ("default", "no_sync", "exact", "exact_no_sync", "harsh", "harsh_no_sync")
+"""Variants that tell what the state synchronisation is good for."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +174,8 @@ def override_config(config: MpcConfig, overrides: Mapping[str, Any], mode: Mode)
 
 def _override_entry(field_name: str, current: Any, entry: str, value: Any) -> Any:
     """The value of a field with one of its entries, or all of it, replaced."""
+    if isinstance(value, Without):
+        return tuple(each for each in current if each != value.entry)
     if not entry:
         return value
     if isinstance(current, Mapping):
@@ -144,44 +188,56 @@ def _override_entry(field_name: str, current: Any, entry: str, value: Any) -> An
     raise BadValue(f"setting '{field_name}' of MpcConfig has no entries, got '{entry}'")
 
 
+def resolve_configs(setup: TrackingSetup) -> dict[Mode, MpcConfig]:
+    """Parameters of both modes: the preset's, then the setup's overrides, then the ablation's.
+
+    Raises:
+        UnknownName: If a name in `setup` is unknown.
+    """
+    ablation = get_ablation(setup.ablation)
+    configs = _resolve(setup, ablation.preset or setup.preset, ablation.mpc)
+    if ablation.equal_compute:
+        stock = _resolve(setup, setup.preset, {})
+        for mode, config in configs.items():
+            samples = compute_policy_steps(stock[mode]) / (config.horizon * config.control_hz)
+            configs[mode] = dataclasses.replace(config, num_samples=max(1, round(samples)))
+    return configs
+
+
+def _resolve(setup: TrackingSetup, preset: str, last: Mapping[str, Any]) -> dict[Mode, MpcConfig]:
+    made = build_configs(make_morphology(setup.robot), RetargeterConfig(preset=preset))
+    return {
+        mode: override_config(override_config(config, setup.overrides, mode), last, mode)
+        for mode, config in made.items()
+    }
+
+
 def make_tuned_morphology(setup: TrackingSetup) -> Morphology:
-    """Make the robot with the parameters that `setup` asks for, in both modes.
+    """Make the robot, with the parameters that `setup` asks for as its own.
 
     Raises:
         UnknownName: If a name in it is unknown.
     """
     morphology = make_morphology(setup.robot)
-    stock = type(morphology).mpc_config
-    ablation = get_ablation(setup.ablation)
-    configs = {}
-    for mode in Mode:
-        own = override_config(stock(morphology, mode), setup.overrides, mode)
-        config = override_config(own, ablation.mpc, mode)
-        if ablation.equal_compute:
-            samples = compute_policy_steps(own) / (config.horizon * config.control_hz)
-            config = dataclasses.replace(config, num_samples=max(1, round(samples)))
-        configs[mode] = config
     # Only this one robot has other parameters, not its class.
-    vars(morphology)["mpc_config"] = configs.__getitem__
+    vars(morphology)["mpc_config"] = resolve_configs(setup).__getitem__
     return morphology
 
 
 def make_retargeter_config(setup: TrackingSetup, seed: int) -> RetargeterConfig:
-    """Settings of the retargeter: one thread, the setup's preset, and its ablation.
+    """Settings of the retargeter: one thread, and its ablation.
+
+    The preset is the default one: that of the setup is in the robot's own parameters already.
 
     Raises:
         UnknownName: If the ablation sets what the retargeter does not have.
     """
-    settings: dict[str, Any] = {"threads": 1, "seed": seed}
-    settings |= {"preset": setup.preset, "sync": setup.sync}
+    settings: dict[str, Any] = {"threads": 1, "seed": seed, "sync": setup.sync}
     settings |= dict(get_ablation(setup.ablation).retargeter)
     known = [each.name for each in dataclasses.fields(RetargeterConfig)]
-    for name, value in list(settings.items()):
-        if name in known:
-            continue
-        if (name, value) != ("preset", "default"):
+    for name in settings:
+        if name not in known:
             raise UnknownName("setting of RetargeterConfig", name, known)
-        del settings[name]
     return RetargeterConfig(**settings)
 
 
