@@ -9,7 +9,7 @@ for the recorder. Publishing replaces one immutable value, so readers need no lo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from xop_lerobot.state import Goal, RobotState
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
+    from xop_lerobot.retarget.online import AppliedChange
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class RobotInfo:
         fps: Rate of the control loop [Hz].
         seed: Seed of its session.
         realtime: Whether its clock is the wall clock.
+        has_truth: Whether its states hold the true position beside the measured one, as only a
+            simulation's can.
     """
 
     name: str
@@ -46,6 +49,7 @@ class RobotInfo:
     fps: int
     seed: int
     realtime: bool = False
+    has_truth: bool = True
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,10 @@ class TickRecord:
         cost: Cost of the plan by term.
         health: Figures on the plan's health by name (solve time, age, effective samples, …).
         finished: Whether the device has played out.
+        estimate: Position that the tick was planned from, where the measured one was put in
+            accordance with the ground first; None where it was not. Shape (nq,).
+        settings: What was in force in the tick (preset, weights, targets, mode, …).
+        changes: What came into force at its beginning.
     """
 
     state: RobotState
@@ -71,6 +79,9 @@ class TickRecord:
     cost: Mapping[str, float]
     health: Mapping[str, float]
     finished: bool = False
+    estimate: np.ndarray | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    changes: tuple[AppliedChange, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.errors import XopError
 from xop_lerobot.link import RobotInfo, TickRecord
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig, EngageRefused, is_lost
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.gestures import DoublePinchDetector, grip_from_pinch
+from xop_lerobot.operator.gestures import Gesture, GestureConfig, GestureReader, grip_from_pinch
 from xop_lerobot.operator.goal_velocity import GoalVelocity
 from xop_lerobot.plant.policy_loop import limit_action
-from xop_lerobot.retarget.arm_bias import ArmBias
-from xop_lerobot.retarget.arm_ik import ArmIk
-from xop_lerobot.retarget.background import BackgroundPlanner
+from xop_lerobot.retarget.arm_driver import ArmDriver
+from xop_lerobot.retarget.changes import Change, Settings, make_toggle, parse_change
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.retarget.plan import Plan
-from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
-from xop_lerobot.state import FRAMES, Goal, RobotState
+from xop_lerobot.retarget.online import AppliedChange, OnlineSettings
+from xop_lerobot.retarget.plan_follower import PlanFollower
+from xop_lerobot.retarget.presets import build_configs
+from xop_lerobot.retarget.smoothing import CommandSmoother
+from xop_lerobot.retarget.state_sync import StateSync, Synced
+from xop_lerobot.state import Goal, RobotState
 
 logger = logging.getLogger(__name__)
 
@@ -40,11 +45,13 @@ class TeleoperationConfig:
         device: Where the operator's motion comes from.
         alignment: How it is laid on the robot.
         retargeter: How goals become commands.
+        gestures: What the operator's pinches do.
     """
 
     device: DeviceConfig = field(default_factory=DeviceConfig)
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     retargeter: RetargeterConfig = field(default_factory=RetargeterConfig)
+    gestures: GestureConfig = field(default_factory=GestureConfig)
 
 
 class Teleoperation:
@@ -53,7 +60,7 @@ class Teleoperation:
     While nobody is engaged, the robot is asked to hold the posture it is in. A device that
     engages by itself does so as soon as the robot has settled; loss of the head's tracking ends
     an engagement, and the next one aligns anew, so no command ever makes a step. A fall ends it
-    too, and nobody engages while the robot counts as fallen.
+    too, and nobody engages while the robot counts as fallen. `change` changes settings meanwhile.
 
     Args:
         config: Its parts.
@@ -61,9 +68,10 @@ class Teleoperation:
     """
 
     def __init__(self, config: TeleoperationConfig, info: RobotInfo) -> None:
-        self.info, self.morphology = info, info.morphology
+        self.config, self.info, self.morphology = config, info, info.morphology
         self.dt = 1 / info.fps
         self.device = make_device(config.device)
+        self._settings = OnlineSettings(self.morphology, config.retargeter)
         model = build_model(self.morphology, "planning", scene=info.scene)
         policy = make_policy(info.low_level, info.low_level_path)
         obstacles: tuple[Obstacle, ...] | None = None
@@ -73,30 +81,32 @@ class Teleoperation:
         self.retargeter = make_retargeter(
             config.retargeter, self.morphology, policy, model, obstacles
         )
+        self._follower = PlanFollower(
+            self.retargeter, self.morphology, self.dt, realtime=info.realtime
+        )
         self.alignment = Alignment(config.alignment)
         self._velocity = GoalVelocity()
-        self._pinch = DoublePinchDetector()
+        self._gestures = GestureReader(config.gestures)
+        self._sync = StateSync(self.morphology, model) if config.retargeter.sync else None
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
-        self._arm_ik = ArmIk(self.morphology)
-        self._arm_bias = ArmBias(self._arm_ik.joint_range)
+        self._arms = ArmDriver(self.morphology)
+        self._smoother = CommandSmoother(self.morphology.command_space, self.dt)
         self._was_engaged = False
-        self._background = BackgroundPlanner(self.retargeter) if info.realtime else None
         self._start_over()
 
     def _start_over(self) -> None:
         self.alignment.disengage()
         self._velocity.reset()
-        self._pinch.reset()
+        self._gestures.reset()
+        self._smoother.reset()
+        if self._sync is not None:
+            self._sync.reset()
         self._mode = self.device.start_mode
+        self._device_mode = self._overruled_mode = None
         self._started = self._was_refused = False
-        self._forget_arms()
-        self._plan: Plan | None = None
-        self._plan_time = self._asked_time = -np.inf
+        self._arms.forget()
+        self._follower.forget()
         self._last_time: float | None = None
-
-    def _forget_arms(self) -> None:
-        """Start the arms anew from the targets that the robot executes."""
-        self._wanted_arms = self._sent_arms = np.zeros(0)
 
     def connect(self) -> None:
         """Open the device; a recording is read and checked here."""
@@ -105,19 +115,57 @@ class Teleoperation:
     def disconnect(self) -> None:
         """Close the device and stop the threads; may be called twice."""
         self.device.disconnect()
-        if self._background is not None:
-            self._background.close()
-        self.retargeter.close()
+        self._follower.close()
 
     def reset(self) -> None:
         """Start over, as after a reset of the robot: nobody is engaged, no plan is known."""
         self._start_over()
 
+    def change(self, change: Change | Mapping[str, Any], source: str = "call") -> dict[str, Any]:
+        """Ask for other settings, from any thread; they hold from the next `step` on.
+
+        All of the change comes into force at once, or none: what is wrong with it is raised
+        here. Commands go on from where they are, within their limits.
+
+        Args:
+            change: The change, or its JSON form (`parse_change`).
+            source: Who asks, for the record.
+
+        Returns:
+            The settings that will be in force, as JSON knows them.
+
+        Raises:
+            UnknownName: If it names something that is not there; lists what is.
+            BadValue: If a value is of the wrong kind or out of its range.
+        """
+        if not isinstance(change, Change):
+            change = parse_change(change)
+        return self._settings.request(change, source).to_dict()
+
+    def toggle(self, name: str, source: str = "call") -> dict[str, Any]:
+        """Toggle the mode (`mode`), a constraint, or a preset against `default`, as `change`.
+
+        Raises:
+            UnknownName: If `name` is none of these, or the robot lacks it.
+            BadValue: If the result would not be valid.
+        """
+        return self._settings.request_from(self._make_toggle(name), source).to_dict()
+
+    def _make_toggle(self, name: str) -> Callable[[Settings], Change]:
+        if name == "mode":
+            return lambda _: Change(mode=Mode(1 - self._mode))
+        return lambda settings: make_toggle(name, settings)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What is in force, and the mode, as JSON knows them."""
+        return {**self._settings.current.to_dict(), "mode": self._mode.name.lower()}
+
     def step(self, state: RobotState) -> tuple[RobotAction, TickRecord]:
         """Decide what the robot does next.
 
         Args:
-            state: The robot now.
+            state: The robot now, as measured.
 
         Returns:
             The action, limited as the robot will limit it, and the record of the tick.
@@ -128,18 +176,45 @@ class Teleoperation:
         """
         dt = self.dt if self._last_time is None else max(state.time - self._last_time, 0.0)
         self._last_time = state.time
+        changes = self._apply_changes()
+        measured, (state, synced) = state, self._synchronise(state)
         poses = self._compute_frames(state)
         frame = self.device.read(state.time)
         frame = self._follow_engagement(state, frame, poses)
+        mode = self._mode
         goal = self._make_goal(state, frame) if frame is not None else None
+        if self._mode is not mode:
+            source = "gesture" if frame is None or frame.mode is None else "device"
+            changes = (*changes, AppliedChange(source, Change(mode=self._mode)))
         if goal is None:
             wanted = self._hold(state)
         else:
             wanted = self._drive(state, goal, poses["head"], dt)
-        previous = RobotAction(state.command, state.mode, state.arms)
-        action = limit_action(self.morphology, wanted, previous, self.dt)
-        self._sent_arms = action.arms[: self._arm_ik.num_joints]
-        return action, self._make_record(state, frame, goal, wanted)
+        action = self._limit(state, wanted)
+        return action, self._make_record(measured, synced, frame, goal, wanted, changes)
+
+    def _apply_changes(self) -> tuple[AppliedChange, ...]:
+        """Put into force what was asked for since the last tick."""
+        changes = self._settings.take()
+        for each in changes:
+            if each.change.mode is not None:
+                self._mode, self._overruled_mode = each.change.mode, self._device_mode
+        if any(each.change.to_dict().keys() - {"mode"} for each in changes):
+            settings = self._settings.current
+            self._follower.configure(
+                configs=build_configs(self.morphology, self.config.retargeter, settings),
+                targets=settings.targets,
+                body=settings.body,
+                constraints=settings.constraints,
+            )
+        return changes
+
+    def _synchronise(self, state: RobotState) -> tuple[RobotState, Synced | None]:
+        """Put the measured state in accordance with the ground; the truth stays beside it."""
+        if self._sync is None:
+            return state, None
+        synced = self._sync.synchronise(state.time, state.qpos, state.qvel, state.mode)
+        return dataclasses.replace(state, qpos=synced.qpos, qvel=synced.qvel), synced
 
     def _compute_frames(self, state: RobotState) -> dict[str, np.ndarray]:
         """Pose of each tracked frame of the robot, as measured. Shapes (7,)."""
@@ -187,26 +262,39 @@ class Teleoperation:
         """
         self.alignment.engage(frame, poses, float(poses["head"][2]))
         self._was_engaged, self._was_refused = True, False
-        self._forget_arms()
+        self._arms.forget()
         self._velocity.reset()
-        (self._background or self.retargeter).reset(state)
-        self._plan = None
+        self._follower.reset(state)
 
     def disengage(self) -> None:
         """Stop driving; the robot holds."""
         self.alignment.disengage()
-        self._plan = None
+        self._follower.forget()
 
     def _make_goal(self, state: RobotState, frame: OperatorFrame) -> Goal | None:
-        if self._pinch.update(frame):
+        gesture = self._gestures.update(frame)
+        if gesture is Gesture.DOUBLE_PINCH:
             self._mode = Mode(1 - self._mode)
-        if frame.mode is not None:
-            self._mode = frame.mode
+        elif gesture is Gesture.BOTH_DOUBLE_PINCH:
+            self._toggle_by_gesture()
+        if frame.mode is not None and frame.mode is not self._overruled_mode:
+            self._mode, self._overruled_mode = frame.mode, None
+        self._device_mode = frame.mode
         if not self.alignment.is_engaged:
             return None
         goals = self.alignment.goal_poses(frame)
         velocities = self._velocity.update(state.time, goals)
         return Goal(goals, velocities, self._mode, grip_from_pinch(frame.pinch))
+
+    def _toggle_by_gesture(self) -> None:
+        """Toggle what both hands toggle, from the next tick on."""
+        name = self.config.gestures.both_double_pinch
+        if name == "none":
+            return
+        try:
+            self.toggle(name, "gesture")
+        except XopError as refusal:
+            logger.warning("The gesture of both hands changes nothing: %s", refusal)
 
     def _hold(self, state: RobotState) -> RobotAction:
         """Stand where and as the robot stands: velocities stop, the posture stays."""
@@ -215,78 +303,50 @@ class Teleoperation:
         return RobotAction(command, Mode.STATIONARY, state.arms)
 
     def _drive(self, state: RobotState, goal: Goal, head: np.ndarray, dt: float) -> RobotAction:
-        self._update_plan(state, goal)
-        arms = state.arms.copy()
-        wrists = compute_wrist_goals(goal.poses, head)
-        num_joints = self._arm_ik.num_joints
-        arms[:num_joints] = self._drive_arms(state, wrists, dt)
-        arms[num_joints:] = self._compute_grippers(goal)
-        if self._plan is None:  # the background planner is still at its first one
+        self._follower.update(state, goal)
+        current = self._follower.current
+        decided = current.get_arms(state.time) if current is not None else {}
+        arms = self._arms.compute(state, goal, head, decided, dt)
+        if current is None:  # the background planner is still at its first one
             return RobotAction(self._hold(state).command, goal.mode, arms)
-        return RobotAction(self._pick_command(self._plan, state.time), goal.mode, arms)
+        command = current.get_command(state.time, self.morphology.command_space)
+        return RobotAction(command, goal.mode, arms)
 
-    def _drive_arms(
-        self, state: RobotState, wrists: Mapping[str, np.ndarray], dt: float
-    ) -> np.ndarray:
-        """Arm targets [rad] that bring the wrists to their goals. Shape (num_joints,)."""
-        ik, bias = self._arm_ik, self._arm_bias
-        executed = state.arms[: ik.num_joints]
-        if not np.array_equal(executed, self._sent_arms):  # new, or somebody else drove the arms
-            self._wanted_arms = executed
-            bias.reset()
-        last, self._wanted_arms = (
-            self._wanted_arms,
-            ik.solve(state.qpos, self._wanted_arms, wrists, dt),
-        )
-        offset = state.qpos[ik.qpos_address] - executed
-        bias.update(offset, self._wanted_arms - last, dt)
-        return bias.compute_targets(self._wanted_arms)
-
-    def _update_plan(self, state: RobotState, goal: Goal) -> None:
-        """Plan where it is due; on the wall clock, ask for it and take the newest there is."""
-        late = self._plan is None or self._plan.mode is not goal.mode
-        period = self.retargeter.control_period(goal.mode)
-        # Half a tick early is closer than half a tick late.
-        if self._background is None:
-            if late or state.time - self._plan_time >= period - self.dt / 2:
-                self._plan, self._plan_time = self.retargeter.plan(state, goal), state.time
-            return
-        if late or state.time - self._asked_time >= period - self.dt / 2:
-            self._background.submit(state, goal)
-            self._asked_time = state.time
-        if (latest := self._background.latest) is not None:
-            self._plan, self._plan_time = latest
-
-    def _pick_command(self, plan: Plan, time: float) -> np.ndarray:
-        """The plan's command for `time`; past its end the last one. Shape (k,)."""
-        step = max(0, round((time - self._plan_time) / POLICY_DT))
-        return plan.commands[min(step, len(plan.commands) - 1)]
-
-    def _compute_grippers(self, goal: Goal) -> np.ndarray:
-        """Openings of the grippers [m], in the order of `arms`."""
-        grips: dict[str, float] = dict(zip(FRAMES[1:], goal.grips, strict=True))
-        openings = []
-        for arm in self.morphology.arms:
-            if arm.gripper:
-                closed, opened = arm.gripper_range
-                openings.append(opened + grips.get(arm.frame, 0.0) * (closed - opened))
-        return np.array(openings)
+    def _limit(self, state: RobotState, wanted: RobotAction) -> RobotAction:
+        """What the robot will execute: bounds, rates and changes of rate, as it limits too."""
+        command = self._smoother.smooth(wanted.command, wanted.mode, state.command)
+        # In stationary mode the robot stops at its full rate; told so at rest, it need not.
+        mode = wanted.mode if self._smoother.is_at_rest(command) else Mode.MOBILE
+        previous = RobotAction(state.command, state.mode, state.arms)
+        smooth = RobotAction(command, mode, wanted.arms)
+        action = limit_action(self.morphology, smooth, previous, self.dt)
+        self._smoother.note(state.command, action.command)
+        self._arms.note(action.arms)
+        return action
 
     def _make_record(
         self,
         state: RobotState,
+        synced: Synced | None,
         frame: OperatorFrame | None,
         goal: Goal | None,
         wanted: RobotAction,
+        changes: tuple[AppliedChange, ...],
     ) -> TickRecord:
-        plan = self._plan if goal is not None else None
-        cost = dict(plan.cost) if plan else {}
-        health = {}
-        if plan is not None:
-            health = {
+        current = self._follower.current if goal is not None else None
+        cost: dict[str, float] = {}
+        health: dict[str, float] = {}
+        if synced is not None:
+            health = {"sync_residual": synced.residual, "sync_status": float(synced.status)}
+        if current is not None:
+            plan = current.plan
+            cost = dict(plan.cost)
+            health |= {
                 "solve_time": plan.timings.get("solve", 0.0),
-                "plan_age": state.time - self._plan_time,
+                "plan_age": state.time - current.measured,
                 "effective_samples": plan.effective_samples,
+                "status": float(plan.status),
+                **plan.health,
             }
         return TickRecord(
             state=state,
@@ -297,4 +357,7 @@ class Teleoperation:
             cost={**cost, "total": sum(cost.values())},
             health=health,
             finished=self.device.is_finished(state.time),
+            estimate=None if synced is None else synced.qpos,
+            settings=self.settings,
+            changes=changes,
         )

@@ -8,6 +8,7 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 
 from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.devices.config import DeviceConfig
+from xop_lerobot.operator.gestures import GestureConfig
 from xop_lerobot.retarget.config import RetargeterConfig
 
 
@@ -27,4 +28,7 @@ class XopConfig(TeleoperatorConfig):
     device: DeviceConfig = field(default_factory=DeviceConfig)  # where the motion comes from
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)  # person to robot
     retargeter: RetargeterConfig = field(default_factory=RetargeterConfig)  # goals to commands
+    gestures: GestureConfig = field(default_factory=GestureConfig)  # what pinches do
+    control: str = ""  # socket for changes: empty for none, true for the default path, or a path
+    keys: bool = False  # let keys of this terminal change settings
     record: RecordingConfig = field(default_factory=RecordingConfig)  # what is written

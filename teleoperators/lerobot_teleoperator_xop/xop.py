@@ -111,6 +111,7 @@ class Xop(Teleoperator):
             device=self.config.device,
             alignment=self.config.alignment,
             retargeter=self.config.retargeter,
+            gestures=self.config.gestures,
         )
         teleoperation = Teleoperation(config, info)
         teleoperation.connect()

@@ -1,9 +1,11 @@
-"""Pinches: the double pinch that toggles the mode, and how far a hand is closed."""
+"""Pinches: double pinches of one hand or of both, and how far a hand is closed."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 
@@ -124,6 +126,11 @@ class DoublePinchDetector:
             self._follow(frame.time, float(frame.pinch[self._hand]))
         return self._take_double(frame.time)
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether pinches are seen that may become a double pinch."""
+        return self._closed or self._taps > 0
+
     def _is_tracked(self, frame: OperatorFrame) -> bool:
         return bool(frame.tracked[1 + self._hand])
 
@@ -173,3 +180,80 @@ class DoublePinchDetector:
         if double:
             self._toggled_at = time
         return double
+
+
+class Gesture(Enum):
+    """What the operator's hands say."""
+
+    DOUBLE_PINCH = "double_pinch"
+    BOTH_DOUBLE_PINCH = "both_double_pinch"
+
+
+@dataclass
+class GestureConfig:
+    """What the gestures do.
+
+    Attributes:
+        double_pinch: When two pinches of one hand count; they toggle the mode.
+        both_double_pinch: What a double pinch of both hands at once toggles: a constraint
+            (`upright`), a preset against `default`, or `none`.
+        window: Longest time between the double pinches of the two hands [s].
+    """
+
+    double_pinch: DoublePinchConfig = field(default_factory=DoublePinchConfig)
+    both_double_pinch: str = "upright"
+    window: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the window.
+
+        Raises:
+            BadValue: If it is not positive.
+        """
+        if not (math.isfinite(self.window) and self.window > 0):
+            raise BadValue(f"gestures.window must be finite and above 0, got {self.window}")
+
+
+class GestureReader:
+    """Tells a double pinch of one hand from one of both hands.
+
+    The double pinch of the hand that toggles counts at once, unless the other hand is just
+    pinching too or has just done so: then it counts when that is decided, as one of both hands
+    or of its own.
+
+    Args:
+        config: The hand that toggles, its thresholds and durations, and the window.
+    """
+
+    def __init__(self, config: GestureConfig | None = None) -> None:
+        config = config or GestureConfig()
+        first = config.double_pinch
+        other = HANDS[1 - HANDS.index(first.hand)]
+        self._first = DoublePinchDetector(first)
+        self._other = DoublePinchDetector(dataclasses.replace(first, hand=other))
+        self._window = config.window
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything seen so far."""
+        self._first.reset()
+        self._other.reset()
+        self._first_at: float | None = None  # a double pinch that is not decided yet
+        self._other_at = -math.inf
+
+    def update(self, frame: OperatorFrame) -> Gesture | None:
+        """Take one sample; return the gesture that is complete with it, None for none."""
+        if self._other.update(frame):
+            self._other_at = frame.time
+        if self._first.update(frame):
+            self._first_at = frame.time
+        if self._first_at is None:
+            return None
+        if abs(self._first_at - self._other_at) <= self._window:
+            self._first_at, self._other_at = None, -math.inf
+            return Gesture.BOTH_DOUBLE_PINCH
+        waited = frame.time - self._first_at
+        if self._other.is_busy and 0 <= waited < self._window:
+            return None
+        self._first_at = None
+        return Gesture.DOUBLE_PINCH

@@ -4,57 +4,71 @@ from __future__ import annotations
 
 import logging
 import threading
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from xop_lerobot.retarget.plan import Plan, Retargeter
+from xop_lerobot.retarget.delay import StatePredictor, predict_goal
+from xop_lerobot.retarget.plan import Retargeter
+from xop_lerobot.retarget.plan_track import PlanTrack, StampedPlan
 from xop_lerobot.state import Goal, RobotState
 
 logger = logging.getLogger(__name__)
 
 
-class StampedPlan(NamedTuple):
-    """A plan and the robot's time of the state it starts from.
-
-    Attributes:
-        plan: The plan.
-        time: Time of its state [s].
-    """
-
-    plan: Plan
-    time: float
+class _Job(NamedTuple):
+    state: RobotState
+    goal: Goal
+    ahead: int
+    epoch: int
 
 
 class BackgroundPlanner:
     """Solves in a thread for the newest state and goal that were submitted.
 
-    A slow solve drops the states that came meanwhile: the next one starts from the newest. What
-    a solve raises is raised in the caller, by `submit` and `latest`, until the next `reset`.
+    A slow solve drops the states that came meanwhile: the next one starts from the newest,
+    predicted to when its plan will take effect. What a solve raises is raised in the caller, by
+    `submit`, `latest` and `at`, until the next `reset`.
 
     Args:
         retargeter: What solves; used by the thread alone from now on.
+        predictor: Predicts the state a plan starts from; None starts from the measured one.
+        threaded: False solves in `run_once` alone, for tests.
     """
 
-    def __init__(self, retargeter: Retargeter) -> None:
-        self._retargeter = retargeter
+    def __init__(
+        self,
+        retargeter: Retargeter,
+        predictor: StatePredictor | None = None,
+        *,
+        threaded: bool = True,
+    ) -> None:
+        self._retargeter, self._predictor = retargeter, predictor
         self._ready = threading.Condition()
-        self._job: tuple[RobotState, Goal, int] | None = None
-        self._latest: StampedPlan | None = None
+        self._job: _Job | None = None
+        self._settings: dict[str, Any] | None = None
+        self._track = PlanTrack()
         self._reset_to: RobotState | None = None
-        self._epoch = 0
+        self._epoch = self._solved_epoch = 0
         self._running = True
         self._failure: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="xop-planner", daemon=True)
-        self._thread.start()
+        self._thread: threading.Thread | None = None
+        if threaded:
+            self._thread = threading.Thread(target=self._run, name="xop-planner", daemon=True)
+            self._thread.start()
 
-    def submit(self, state: RobotState, goal: Goal) -> None:
+    def submit(self, state: RobotState, goal: Goal, ahead: int = 0) -> None:
         """Ask for a plan from `state` to `goal`; replaces what has not been begun.
+
+        Args:
+            state: The robot now.
+            goal: The goal now.
+            ahead: Control steps after which the plan will take effect [20 ms].
 
         Raises:
             Exception: Whatever the last solve failed with.
         """
         with self._ready:
             self._check()
-            self._job = (state, goal, self._epoch)
+            self._job = _Job(state, goal, ahead, self._epoch)
             self._ready.notify()
 
     @property
@@ -66,13 +80,29 @@ class BackgroundPlanner:
         """
         with self._ready:
             self._check()
-            return self._latest
+            return self._track.newest
+
+    def at(self, time: float) -> StampedPlan | None:
+        """The plan that counts at `time` [s] of the robot's clock, None before the first.
+
+        Raises:
+            Exception: Whatever the last solve failed with.
+        """
+        with self._ready:
+            self._check()
+            return self._track.at(time)
+
+    def configure(self, **settings: Any) -> None:
+        """Give the retargeter other settings (`MpcRetargeter.configure`) before its next solve."""
+        with self._ready:
+            self._settings = (self._settings or {}) | settings
 
     def reset(self, state: RobotState) -> None:
         """Forget all plans, also the one being solved, and failures; start anew from `state`."""
         with self._ready:
             self._epoch += 1
-            self._job = self._latest = self._failure = None
+            self._job = self._failure = None
+            self._track.clear()
             self._reset_to = state
 
     def close(self) -> None:
@@ -80,7 +110,8 @@ class BackgroundPlanner:
         with self._ready:
             self._running = False
             self._ready.notify()
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
 
     def _check(self) -> None:
         """Raise what the last solve failed with; the caller holds the lock."""
@@ -88,26 +119,45 @@ class BackgroundPlanner:
             raise self._failure
 
     def _run(self) -> None:
-        epoch = 0
         while True:
             with self._ready:
                 self._ready.wait_for(lambda: self._job is not None or not self._running)
                 if not self._running:
                     return
-                assert self._job is not None
-                state, goal, wanted = self._job
-                reset_to, self._job = self._reset_to, None
-            try:
-                if wanted != epoch and reset_to is not None:
-                    self._retargeter.reset(reset_to)
-                    epoch = wanted
-                plan = self._retargeter.plan(state, goal)
-            except Exception as failure:
-                logger.exception("the planner has failed")
-                with self._ready:
-                    if wanted == self._epoch:
-                        self._failure, self._job = failure, None
-                continue
+            self.run_once()
+
+    def run_once(self) -> None:
+        """Solve what was asked for last, if anything; the thread does nothing else."""
+        with self._ready:
+            job, self._job = self._job, None
+            reset_to, settings = self._reset_to, self._settings
+            self._settings = None
+            track = self._track.copy()
+        if job is None:
+            return
+        try:
+            if settings is not None:
+                self._retargeter.configure(**settings)
+            if job.epoch != self._solved_epoch and reset_to is not None:
+                self._retargeter.reset(reset_to)
+                self._solved_epoch = job.epoch
+            plan = self._solve(job, track)
+        except Exception as failure:
+            logger.exception("the planner has failed")
             with self._ready:
-                if wanted == self._epoch:
-                    self._latest = StampedPlan(plan, state.time)
+                if job.epoch == self._epoch:
+                    self._failure, self._job = failure, None
+            return
+        with self._ready:
+            if job.epoch == self._epoch:
+                self._track.add(plan)
+
+    def _solve(self, job: _Job, track: PlanTrack) -> StampedPlan:
+        """Plan from where the robot will be when the plan takes effect."""
+        state, goal = job.state, job.goal
+        if self._predictor is not None:
+            state = self._predictor.predict(state, track, job.ahead)
+            goal = predict_goal(goal, state.time - job.state.time)
+        plan = self._retargeter.plan(state, goal)
+        period = self._retargeter.control_period(goal.mode)
+        return StampedPlan(plan, state.time, job.state.time, period)

@@ -142,6 +142,19 @@ def _to_json(weights: Mapping[str, float]) -> dict[str, float | str]:
     return {name: "inf" if value == math.inf else value for name, value in weights.items()}
 
 
+def make_toggle(name: str, settings: Settings) -> Change:
+    """Make the change that toggles a constraint, or a preset against `default`.
+
+    Raises:
+        UnknownName: If `name` is neither; lists those that are.
+    """
+    if name in CONSTRAINTS:
+        return Change(constraints={name: name not in settings.constraints})
+    if name in PRESETS:
+        return Change(preset="default" if settings.preset == name else name)
+    raise UnknownName("constraint or preset", name, (*CONSTRAINTS, *PRESETS))
+
+
 def _parse_names(name: str, value: object) -> tuple[str, ...]:
     if isinstance(value, (list, tuple)) and all(isinstance(each, str) for each in value):
         return tuple(value)

@@ -6,12 +6,14 @@ import mujoco
 
 from xop_lerobot.low_level.policy import LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.changes import make_settings
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacle_file import load_obstacles
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.plan import Retargeter
+from xop_lerobot.retarget.presets import build_configs
 
 
 def make_retargeter(
@@ -38,4 +40,12 @@ def make_retargeter(
     obstacles = make_obstacles(model) if obstacles is None else obstacles
     if config.obstacles:
         obstacles += load_obstacles(config.obstacles)
-    return MpcRetargeter(morphology, policy, model, config, obstacles=obstacles)
+    retargeter = MpcRetargeter(morphology, policy, model, config, obstacles=obstacles)
+    settings = make_settings(morphology, config)
+    retargeter.configure(
+        build_configs(morphology, config, settings),
+        settings.targets,
+        settings.body,
+        settings.constraints,
+    )
+    return retargeter

@@ -1,0 +1,101 @@
+"""Arms and grippers of one tick: by inverse kinematics, or as the plan has decided."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.arm_bias import ArmBias
+from xop_lerobot.retarget.arm_ik import ArmIk
+from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
+from xop_lerobot.state import FRAMES, Goal, RobotState
+
+ARM_SPEED = 3.0
+"""Largest speed of arm targets that a plan decides, as of the inverse kinematics [rad/s]."""
+_MAX_DT = 0.05  # a tick that comes late counts as so much [s]
+
+
+class ArmDriver:
+    """Computes arm targets, and knows the last ones so that they go on without a step.
+
+    Arms of which the plan decides a joint are left out of the inverse kinematics. When that
+    changes, when somebody else has driven the arms, and at an engagement, it starts anew from
+    the targets that are executed.
+
+    Args:
+        morphology: The robot.
+    """
+
+    def __init__(self, morphology: Morphology) -> None:
+        self.morphology = morphology
+        self.ik = ArmIk(morphology)
+        self.bias = ArmBias(self.ik.joint_range)
+        self._joints = [joint for arm in morphology.arms for joint in arm.joints]
+        self.forget()
+
+    def forget(self) -> None:
+        """Start anew from the executed targets at the next tick."""
+        self._wanted = self._sent = np.zeros(0)
+        self._decided: frozenset[str] = frozenset()
+
+    def note(self, arms: np.ndarray) -> None:
+        """Take down the targets that were sent. Shape (m,)."""
+        self._sent = arms[: self.ik.num_joints]
+
+    def compute(
+        self,
+        state: RobotState,
+        goal: Goal,
+        head: np.ndarray,
+        decided: Mapping[str, float],
+        dt: float,
+    ) -> np.ndarray:
+        """Compute the targets of arms and grippers.
+
+        Args:
+            state: The robot now.
+            goal: Goals of the wrists and how far the hands are closed.
+            head: Pose of the robot's head. Shape (7,).
+            decided: Targets of the joints that the plan decides [rad].
+            dt: Time since the last tick [s].
+
+        Returns:
+            Joint targets [rad], then gripper openings [m]. Shape (m,).
+        """
+        num_joints, executed = self.ik.num_joints, state.arms[: self.ik.num_joints]
+        if not np.array_equal(executed, self._sent) or self._decided != frozenset(decided):
+            self._wanted = executed
+            self.bias.reset()
+        self._decided = frozenset(decided)
+        wrists = compute_wrist_goals(self._find_ik_goals(goal), head)
+        last, wanted = self._wanted, self.ik.solve(state.qpos, self._wanted, wrists, dt)
+        planned = np.zeros(num_joints, dtype=bool)
+        for name, angle in decided.items():
+            i = self._joints.index(name)
+            reach = ARM_SPEED * min(dt, _MAX_DT)
+            wanted[i] = np.clip(angle, executed[i] - reach, executed[i] + reach)
+            planned[i] = True
+        self._wanted = wanted
+        self.bias.update(state.qpos[self.ik.qpos_address] - executed, wanted - last, dt)
+        # The plan's prediction has the offset of the low-level policy in it.
+        targets = np.where(planned, wanted, self.bias.compute_targets(wanted))
+        return np.concatenate([targets, self.compute_grippers(goal)])
+
+    def _find_ik_goals(self, goal: Goal) -> dict[str, np.ndarray]:
+        """Goals without those of the arms that the plan decides."""
+        taken = {
+            arm.frame for arm in self.morphology.arms if not self._decided.isdisjoint(arm.joints)
+        }
+        return {name: pose for name, pose in goal.poses.items() if name not in taken}
+
+    def compute_grippers(self, goal: Goal) -> np.ndarray:
+        """Openings of the grippers [m], in the order of `arms`."""
+        grips: dict[str, float] = dict(zip(FRAMES[1:], goal.grips, strict=True))
+        openings = []
+        for arm in self.morphology.arms:
+            if arm.gripper:
+                closed, opened = arm.gripper_range
+                openings.append(opened + grips.get(arm.frame, 0.0) * (closed - opened))
+        return np.array(openings)

@@ -1,0 +1,138 @@
+"""Presets: whole sets of parameters by name, among them our implementation of the paper's."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+from xop_lerobot.command import Mode
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.changes import Settings, make_settings
+from xop_lerobot.retarget.config import (
+    PRESETS,
+    CostWeights,
+    MpcConfig,
+    PaperParameters,
+    RetargeterConfig,
+)
+
+_FAR = 1e6  # no goal is further away [m]
+_PAPER_WEIGHTS = CostWeights(
+    position=1.0,
+    orientation=1.0,
+    tilt_share=1.0,
+    stance=0.1,
+    collision=1.0,
+    collision_velocity=1.0,
+    collision_decay=1.0,
+    collision_velocity_decay=10.0,
+    collision_range=math.inf,
+    upright=1.0,
+    control=0.1,
+    change=0.0,
+    terminal=1.0,  # the paper does not give w_f
+    fall=0.0,
+    support=0.0,
+    lean=0.0,
+    lateral=0.0,
+)
+
+
+def _keep(morphology: Morphology, config: MpcConfig, paper: PaperParameters) -> MpcConfig:
+    """Take the robot's own parameters."""
+    del morphology, paper
+    return config
+
+
+def _make_conservative(
+    morphology: Morphology, config: MpcConfig, paper: PaperParameters
+) -> MpcConfig:
+    """Smoother and slower: the part of the paper's w_a = 0.5.
+
+    The paper's control energy weighs the absolute command. Here it is the change of the command
+    that costs, and the proposal takes its time.
+    """
+    del morphology, paper
+    weights = dataclasses.replace(config.weights, change=0.05)
+    return dataclasses.replace(config, weights=weights, proposal_s=1.8 * config.proposal_s)
+
+
+def _make_aggressive(
+    morphology: Morphology, config: MpcConfig, paper: PaperParameters
+) -> MpcConfig:
+    """Faster and rougher: the part of the paper's w_a = 0.02."""
+    del morphology, paper
+    weights = dataclasses.replace(config.weights, change=0.0)
+    return dataclasses.replace(config, weights=weights, proposal_s=0.6 * config.proposal_s)
+
+
+def _make_table1(morphology: Morphology, config: MpcConfig, paper: PaperParameters) -> MpcConfig:
+    """Our implementation of the paper's Table I; its authors' code is not public.
+
+    What the table leaves open is as in pytorch_mppi's KMPPI, which the paper names: half as many
+    support points as steps, a kernel of zero mean and a width of one step, one step of shift,
+    raw weights, the importance-sampling term. No fixed candidates, no observer of the drift, no
+    preview and no extrapolation; a goal far away is not held near.
+    """
+    joints = [joint for arm in morphology.arms for joint in arm.joints]
+    entries = (*morphology.command_space.names, *joints)
+    return dataclasses.replace(
+        config,
+        optimizer="kmppi",
+        num_samples=paper.num_samples,
+        horizon=paper.horizon,
+        noise_std=dict.fromkeys(entries, paper.noise_std),
+        control_hz=paper.control_hz,
+        num_knots=max(1, paper.horizon // 2),
+        kernel_width=1.0,
+        kernel_mean="zero",
+        shift="one",
+        sampling="gaussian",
+        sample_plan=False,
+        weighting="raw",
+        temperature=0.001,
+        importance_cost=True,
+        min_noise=1.0,
+        preview_s=0.0,
+        extrapolation_s=0.0,
+        candidates=(),
+        control_reference="zero",
+        observe_drift=False,
+        reach=_FAR,
+        weights=_PAPER_WEIGHTS,
+    )
+
+
+_MAKERS: dict[str, Callable[[Morphology, MpcConfig, PaperParameters], MpcConfig]] = {
+    "default": _keep,
+    "conservative": _make_conservative,
+    "aggressive": _make_aggressive,
+    "table1": _make_table1,
+}
+assert tuple(_MAKERS) == PRESETS
+
+
+def build_configs(
+    morphology: Morphology, config: RetargeterConfig, settings: Settings | None = None
+) -> dict[Mode, MpcConfig]:
+    """Build the parameters of each mode: the preset's, then what was set by hand.
+
+    Args:
+        morphology: The robot.
+        config: Settings of the session; zeros leave the preset's value.
+        settings: What is in force; by default what `config` starts with.
+    """
+    settings = settings or make_settings(morphology, config)
+    paper = morphology.variants[settings.variant].paper
+    numbers = {
+        name: getattr(config, name)
+        for name in ("num_samples", "horizon", "control_hz")
+        if getattr(config, name)
+    }
+    configs = {}
+    for mode in Mode:
+        made = _MAKERS[settings.preset](morphology, morphology.mpc_config(mode), paper[mode])
+        weights = dataclasses.replace(made.weights, **settings.weights)
+        configs[mode] = dataclasses.replace(made, weights=weights, **numbers)
+    return configs
