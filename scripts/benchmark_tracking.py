@@ -77,6 +77,8 @@ def parse_args(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--fresh", action="store_true", help="forget what the JSON file holds")
     add("--plot", type=Path, help="draw the first run into this picture and stop")
     add("--write-docs", action="store_true", help="fill docs/benchmarks.md from --json and stop")
+    add("--bench", type=Path, nargs="+", default=[], metavar="FILE",
+        help="JSON files of xop-bench for --write-docs")  # fmt: skip
     args = parser.parse_args(arguments)
     if args.write_docs and args.json is None:
         parser.error("--write-docs needs --json FILE")
@@ -189,8 +191,7 @@ def main() -> int:
     args = parse_args()
     try:
         if args.write_docs:
-            for path in write_documents(ROOT, args.json):
-                print(f"written: {path}")
+            print("\n".join(write_documents(ROOT, args.json, args.bench)))
             return 0
         setups = make_setups(args)
         if args.plot is not None:

@@ -28,7 +28,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.errors import BadValue, UnknownName, XopError
-from xop_lerobot.evaluation.tracking_report import describe_machine
+from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
 from xop_lerobot.evaluation.tracking_scenarios import bend_from, make_curve
 from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.policy import POLICY_DT, make_policy
@@ -45,17 +45,6 @@ from xop_lerobot.retarget.state_sync import StateSync
 from xop_lerobot.state import Goal, RobotState
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 from xop_lerobot.transforms import make_pose
-
-KEYS = (
-    "step_ms_median",
-    "step_ms_p99",
-    "rollout_ms_median",
-    "physics_ms_median",
-    "policy_ms_median",
-    "overhead_ratio",
-    "control_hz",
-)
-"""Figures of the JSON file that are a contract."""
 
 
 @dataclass(frozen=True)
@@ -249,56 +238,6 @@ def _sway(home: np.ndarray, time: float) -> np.ndarray:
     pose = bend_from(home, pitch=0.15 * np.sin(1.1 * time), yaw=0.4 * np.sin(0.7 * time))
     down = 0.06 * (1 - np.cos(0.9 * time))
     return make_pose(pose[:3] - np.array([0, 0, down]), pose[3:])
-
-
-def summarise(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Figures of timed solves.
-
-    Args:
-        rows: Times by part of every solve [s]; ``step`` is the whole, ``bare`` the bare rollout,
-            ``physics`` and ``policy`` their time within the solve.
-
-    Returns:
-        The figures of `KEYS`; ``control_hz_p99``, ``sync_ms_median``; ``overhead_ratio_p25`` and
-        ``_p75``, quartiles of the ratio within single solves; ``profile`` by part [ms].
-    """
-    parts = {name: np.array([row[name] for row in rows]) * 1000 for name in rows[0]}
-    medians = {name: float(np.median(values)) for name, values in parts.items()}
-    p99 = float(np.percentile(parts["step"], 99))
-    ratios = parts["step"] / parts["bare"]
-    return {
-        "step_ms_median": medians["step"],
-        "step_ms_p99": p99,
-        "rollout_ms_median": medians["bare"],
-        "physics_ms_median": medians["physics"],
-        "policy_ms_median": medians["policy"],
-        "overhead_ratio": medians["step"] / medians["bare"],
-        "control_hz": 1000 / medians["step"],
-        "control_hz_p99": 1000 / p99,
-        "sync_ms_median": medians["sync"],
-        "overhead_ratio_p25": float(np.percentile(ratios, 25)),
-        "overhead_ratio_p75": float(np.percentile(ratios, 75)),
-        "profile": make_profile(medians),
-    }
-
-
-def make_profile(medians: Mapping[str, float]) -> dict[str, float]:
-    """Split the step into parts that add up to it, but for medians not adding up exactly.
-
-    Args:
-        medians: Median time of every part [ms].
-
-    Returns:
-        Time by part [ms]; ``other`` is what no part tells.
-    """
-    profile = {"state sync": medians["sync"], "physics": medians["physics"]}
-    profile["low-level policy"] = medians["policy"]
-    glue = medians.get("rollout", 0.0) - medians["physics"] - medians["policy"]
-    profile["rollout, rest"] = glue
-    known = ("step", "sync", "solve", "bare", "rollout", "physics", "policy")
-    profile |= {name: value for name, value in medians.items() if name not in known}
-    profile["other"] = medians["step"] - sum(profile.values())
-    return profile
 
 
 def print_profile(figures: Mapping[str, Any]) -> None:

@@ -7,6 +7,7 @@ that an error is the robot's and not that of where it believed to be when it was
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from time import perf_counter
@@ -287,6 +288,7 @@ def make_record(
         "sync": retargeter.sync,
         "preset": get_ablation(setup.ablation).preset or setup.preset,
         "seed": seed,
+        "setup": dataclasses.asdict(setup),
         "hold": setup.hold,
         "samples": config.num_samples,
         "horizon": config.horizon,

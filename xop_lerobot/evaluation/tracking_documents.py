@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.evaluation.bench_report import describe_versions, make_bench_blocks
 from xop_lerobot.evaluation.tracking_report import (
     Run,
     fill_document,
@@ -16,72 +17,121 @@ from xop_lerobot.evaluation.tracking_report import (
     read_runs,
 )
 from xop_lerobot.evaluation.tracking_scenarios import SCENARIO_GROUPS
-from xop_lerobot.evaluation.tracking_setup import ABLATIONS, SYNC_VARIANTS
+from xop_lerobot.evaluation.tracking_setup import (
+    ABLATIONS,
+    SYNC_VARIANTS,
+    TrackingSetup,
+)
 
 DOCUMENT = Path("docs/benchmarks.md")
 ROBOTS = ("g1", "rby1")
-LEADS = {
-    name: ablation
-    for name, ablation in ABLATIONS.items()
-    if name not in SYNC_VARIANTS or name == "default"
+VARIANTS = {
+    "ablations": {
+        name: ablation
+        for name, ablation in ABLATIONS.items()
+        if name not in SYNC_VARIANTS or name == "default"
+    },
+    "sync": {name: ABLATIONS[name] for name in SYNC_VARIANTS},
 }
-"""Variants of the retargeter itself."""
+"""Variants of the retargeter itself, and of state synchronisation and noise, by table."""
+ASKED = (
+    "g1 stationary ablations",
+    "g1 mobile ablations",
+    "g1 curve ablations",
+    "rby1 mobile ablations",
+    "rby1 curve ablations",
+    "g1 stationary sync",
+    "g1 mobile sync",
+    "rby1 mobile sync",
+)
+"""Tables of variants that the document has."""
 
 
-def write_documents(root: Path, results: Path) -> list[Path]:
-    """Put tables of `results` between the markers of docs/benchmarks.md.
+def write_documents(root: Path, results: Path, benches: Sequence[Path] = ()) -> list[str]:
+    """Put tables of results between the markers of docs/benchmarks.md.
+
+    Runs that were made with settings which are no longer the robots' own are left out.
 
     Args:
         root: The repository.
         results: JSON file of scripts/benchmark_tracking.py.
+        benches: JSON files of xop-bench, in the order of the table.
 
     Returns:
-        What was written.
+        What was done, a line each.
 
     Raises:
-        BadValue: If the file holds no results, or the document lacks a marker.
+        BadValue: If a file holds no results, or the document lacks a marker.
     """
-    if not results.exists():
-        raise BadValue(f"there are no results at '{results}'")
-    runs = read_runs(results)
+    for path in (results, *benches):
+        if not path.exists():
+            raise BadValue(f"there are no results at '{path}'")
+    everything = read_runs(results)
+    runs = {key: run for key, run in everything.items() if is_current(key, run)}
     machine = json.loads(results.read_text())["machine"]
     document = root / DOCUMENT
-    blocks = make_blocks(runs, machine)
+    blocks = make_blocks(runs, machine) if runs else {}
+    if benches:
+        blocks |= make_bench_blocks([json.loads(path.read_text()) for path in benches])
     document.write_text(fill_document(document.read_text(), blocks))
-    return [document]
+    lines = [f"written: {document} ({', '.join(blocks)})"]
+    if len(runs) < len(everything):
+        lines.append(f"left out: {len(everything) - len(runs)} runs with other settings")
+    return lines
+
+
+def is_current(key: str, run: Run) -> bool:
+    """Whether a run was made as the ablation of that name is now."""
+    try:
+        setup = TrackingSetup(**run["setup"])
+        return setup.is_standard and setup.compute_key(run["seed"]) == key
+    except (KeyError, TypeError, XopError):  # made by another version
+        return False
 
 
 def make_blocks(runs: Mapping[str, Run], machine: Mapping[str, Any]) -> dict[str, str]:
-    """Tables by the name of their markers; those without a run are left as they are."""
+    """Tables by the name of their markers; those without a run are left as they are.
+
+    Tables of scenarios take the runs with the longest hold, tables of variants those that were
+    held as long as the variants.
+    """
     blocks = {"machine": describe_conditions(runs, machine)}
     for robot in ROBOTS:
-        own = {key: run for key, run in runs.items() if run["robot"] == robot}
         for kind, names in SCENARIO_GROUPS.items():
-            if any(
-                run["scenario"] in names and run["ablation"] == "default" for run in own.values()
-            ):
-                blocks[f"{robot} {kind}"] = make_scenario_table(own, robot, names)
-        for kind in ("stationary", "mobile", "curve"):
-            names = SCENARIO_GROUPS[kind]
-            chosen = [run for run in own.values() if run["scenario"] in names]
-            if len({run["ablation"] for run in chosen}) > 1:
-                blocks[f"{robot} {kind} ablations"] = make_ablation_table(own, robot, names, LEADS)
-                blocks[f"{robot} {kind} sync"] = make_ablation_table(
-                    own, robot, names, {name: ABLATIONS[name] for name in SYNC_VARIANTS}
-                )
+            own = {
+                key: run
+                for key, run in runs.items()
+                if run["robot"] == robot and run["scenario"] in names
+            }
+            if not own:
+                continue
+            stock = [run for run in own.values() if run["ablation"] == "default"]
+            if stock:
+                longest = _keep_holds(own, {max(run["hold"] for run in stock)})
+                blocks[f"{robot} {kind}"] = make_scenario_table(longest, robot, names)
+            for suffix, variants in VARIANTS.items():
+                if f"{robot} {kind} {suffix}" in ASKED:
+                    others = [run for run in own.values() if run["ablation"] in variants]
+                    holds = {run["hold"] for run in others if run["ablation"] != "default"}
+                    if holds:
+                        blocks[f"{robot} {kind} {suffix}"] = make_ablation_table(
+                            _keep_holds(own, holds), robot, names, variants
+                        )
     return blocks
 
 
+def _keep_holds(runs: Mapping[str, Run], holds: Collection[float]) -> dict[str, Run]:
+    return {key: run for key, run in runs.items() if run["hold"] in holds}
+
+
 def describe_conditions(runs: Mapping[str, Run], machine: Mapping[str, Any]) -> str:
-    """Machine, versions and seeds, in one sentence each."""
+    """Machine, versions, seeds and holds in two sentences."""
     seeds = sorted({run["seed"] for run in runs.values()})
-    noise = sorted({run["noise"] for run in runs.values() if run["ablation"] == "default"})
-    holds = sorted({run["hold"] for run in runs.values()})
-    versions = ", ".join(
-        f"{name} {value}" for name, value in machine.items() if name != "processor"
-    )
+    stock = [run for run in runs.values() if run["ablation"] == "default"] or list(runs.values())
+    holds = sorted({run["hold"] for run in stock})
+    noise = sorted({run["noise"] for run in stock})
     return (
-        f"{machine['processor']}; {versions}. {len(runs)} runs; seeds {seeds[0]} to {seeds[-1]}; "
-        f"sensor noise: {', '.join(noise)}; goals held for "
-        f"{', '.join(f'{hold:g}' for hold in holds)} s."
+        f"{describe_versions(machine)} {len(runs)} runs; seeds {seeds[0]} to {seeds[-1]}; sensor "
+        f"noise `{', '.join(noise)}`; goals held for "
+        f"{' and '.join(f'{hold:g}' for hold in holds)} s (variants for the shorter)."
     )

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import platform
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +12,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.evaluation.bench_report import describe_machine, make_table
 from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, Scenario
 
 Run = Mapping[str, Any]
@@ -58,24 +56,6 @@ def read_runs(path: Path) -> dict[str, dict[str, Any]]:
         raise BadValue(f"'{path}' holds no results of the tracking benchmark: {error!r}") from error
 
 
-def describe_machine() -> dict[str, str]:
-    """Processor, cores and versions: what figures travel with."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
-    packages = ("mujoco", "numpy", "mink", "onnxruntime")
-    return {
-        "processor": model,
-        "cores": str(len(os.sched_getaffinity(0))),
-        "python": platform.python_version(),
-        **{name: version(name) for name in packages},
-    }
-
-
 # -- tables --------------------------------------------------------------------------------------
 
 STATIONARY_COLUMNS = {
@@ -116,9 +96,12 @@ ARMS_COLUMNS = {
 SUMMED = ("falls", "collisions", "goals", "collided_goals", "arrived_goals")
 ABLATION_COLUMNS = {
     "final [cm]": "final_mean_cm",
-    "[°]": "final_mean_deg",
+    "final [°]": "final_mean_deg",
     "after, p95 [cm]": "after_p95_cm",
-    "moving, mean [cm]": "moving_mean_cm",
+    "after, p95 [°]": "after_p95_deg",
+    "mean [cm]": "moving_mean_cm",
+    "worst [cm]": "moving_max_cm",
+    "mean [°]": "moving_mean_deg",
 }
 
 
@@ -161,12 +144,6 @@ def format_cell(runs: Sequence[Run], metric: str) -> str:
     return f"{format_number(median)} / {format_number(worst)}"
 
 
-def make_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [headings, ["---"] * len(headings), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def select(runs: Mapping[str, Run], **wanted: Any) -> list[Run]:
     """Runs whose entries are as wanted, in order of their seeds."""
     found = [run for run in runs.values() if all(run[k] == v for k, v in wanted.items())]
@@ -202,30 +179,38 @@ def make_ablation_table(
 
     A figure that a scenario does not have leaves that scenario out of its column.
     """
-    rows = []
-    for name, ablation in ablations.items():
-        found = [
+    groups = {
+        name: [
             run
             for scenario in scenarios
             for run in select(runs, robot=robot, scenario=scenario, ablation=name)
         ]
+        for name in ablations
+    }
+    columns = {
+        heading: metric
+        for heading, metric in ABLATION_COLUMNS.items()
+        if any(metric in run["metrics"] for found in groups.values() for run in found)
+    }
+    rows = []
+    for name, found in groups.items():
         if not found:
             continue
-        cells = []
-        for metric in ABLATION_COLUMNS.values():
-            cells.append(format_cell([run for run in found if metric in run["metrics"]], metric))
+        cells = [
+            format_cell([run for run in found if metric in run["metrics"]], metric)
+            for metric in columns.values()
+        ]
         steps = sorted({round(run["physics_steps_per_s"]) for run in found})
-        label = " and ".join(str(step) for step in steps)
         rows.append(
             [
-                f"`{name}`: {ablation.title}",
+                f"`{name}`: {ablations[name].title}",
                 *cells,
                 format_cell(found, "falls"),
-                label,
+                " and ".join(str(step) for step in steps),
                 str(len(found)),
             ]
         )
-    return make_table(["variant", *ABLATION_COLUMNS, "falls", "physics steps/s", "runs"], rows)
+    return make_table(["variant", *columns, "falls", "physics steps/s", "runs"], rows)
 
 
 # -- documents -----------------------------------------------------------------------------------

@@ -121,10 +121,22 @@ class TrackingSetup:
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def compute_key(self, seed: int) -> str:
-        """A name of the run with `seed` that changes with any of its settings."""
-        settings = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
-        digest = hashlib.sha256(settings.encode()).hexdigest()[:8]
+        """A name of the run with `seed` that changes with any of its resolved settings."""
+        configs = {mode.name: dataclasses.asdict(each) for mode, each in self.resolve().items()}
+        settings = [dataclasses.asdict(self), configs]
+        text = json.dumps(settings, sort_keys=True, default=str)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:8]
         return f"{self.robot}/{self.scenario}/{self.ablation}/{seed}/{digest}"
+
+    def resolve(self) -> dict[Mode, MpcConfig]:
+        """Parameters of both modes; see `resolve_configs`."""
+        return resolve_configs(self)
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether the run belongs into the documents: nothing was set but by the ablation."""
+        standard = TrackingSetup(self.robot, self.scenario, self.ablation)
+        return dataclasses.replace(self, hold=standard.hold, goals=standard.goals) == standard
 
     @property
     def resolved_noise(self) -> str:
