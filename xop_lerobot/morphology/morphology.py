@@ -13,12 +13,10 @@ import numpy as np
 from xop_lerobot.command import ActionLayout, CommandSpace, Mode, RobotAction
 from xop_lerobot.morphology.effect import Effect
 from xop_lerobot.registry import Registry
-from xop_lerobot.retarget.config import PaperParameters
+from xop_lerobot.retarget.config import MpcConfig, PaperParameters
 
 if TYPE_CHECKING:
     import mujoco
-
-    from xop_lerobot.retarget.config import MpcConfig
 
 ModelKind = Literal["full", "planning"]
 
@@ -55,11 +53,13 @@ class Variant:
         targets: Tracked frames that the retargeter follows; the arms' inverse kinematics follow
             the other wrists.
         body: Command entries and arm joints that it decides; empty for the whole command.
+        configs: Parameters of the controller in each mode; the robot's own in those left out.
         paper: The paper's parameters in each mode, for the preset `table1`.
     """
 
     targets: tuple[str, ...] = ("head",)
     body: tuple[str, ...] = ()
+    configs: Mapping[Mode, MpcConfig] = field(default_factory=dict)
     paper: Mapping[Mode, PaperParameters] = field(default_factory=lambda: PAPER_HUMANOID)
 
 

@@ -124,7 +124,7 @@ def build_configs(
         settings: What is in force; by default what `config` starts with.
     """
     settings = settings or make_settings(morphology, config)
-    paper = morphology.variants[settings.variant].paper
+    variant = morphology.variants[settings.variant]
     numbers = {
         name: getattr(config, name)
         for name in ("num_samples", "horizon", "control_hz")
@@ -132,7 +132,8 @@ def build_configs(
     }
     configs = {}
     for mode in Mode:
-        made = _MAKERS[settings.preset](morphology, morphology.mpc_config(mode), paper[mode])
+        own = variant.configs.get(mode) or morphology.mpc_config(mode)
+        made = _MAKERS[settings.preset](morphology, own, variant.paper[mode])
         weights = dataclasses.replace(made.weights, **settings.weights)
         configs[mode] = dataclasses.replace(made, weights=weights, **numbers)
     return configs
