@@ -8,16 +8,19 @@ known is 0, and a flag says so (`operator.engaged`, `operator.tracked`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
 
 from xop_lerobot.dataset.body import Body
+from xop_lerobot.errors import BadValue
 from xop_lerobot.link import Outcome, RobotInfo, TickRecord
 from xop_lerobot.state import FRAMES, RobotState
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 COST_NAMES = (
-    "tracking", "stance", "collision", "control", "terminal", "support", "lateral", "fall", "total",
+    "tracking", "stance", "collision", "upright", "control", "change", "terminal", "support",
+    "lateral", "fall", "total",
 )  # fmt: skip
 """Terms of `retargeter.cost`; a term that a retargeter does not have is 0."""
 HEALTH_NAMES = (
@@ -47,6 +50,7 @@ class Columns:
     def __init__(self, info: RobotInfo) -> None:
         morphology = info.morphology
         self._frames = tuple(morphology.frames)
+        self._has_truth = info.has_truth
         self._body = Body(morphology)
         effort = self._body.actuator_names
         self.features: dict[str, dict] = {
@@ -101,9 +105,34 @@ class Columns:
         if tick is not None:
             values["retargeter.command"] = tick.command
         values |= {f"goal.{name}": pose for name, pose in goals.items()}
-        poses = self._body.compute_poses(state.true_qpos)
+        poses = self._body.compute_poses(self._find_position(state, tick))
         values |= {f"robot.{name}": pose for name, pose in poses.items()}
         return {key: _cast(values.get(key), spec) for key, spec in self.features.items()}
+
+    def _find_position(self, state: RobotState, tick: TickRecord | None) -> np.ndarray:
+        """Where the robot is: in truth, else as synchronised, else as measured. Shape (nq,)."""
+        if self._has_truth or tick is None or tick.estimate is None:
+            return state.true_qpos
+        return tick.estimate
+
+
+def has_all_columns(features: Mapping[str, Mapping], columns: Columns, root: Path) -> bool:
+    """Whether a dataset has the columns that would be recorded.
+
+    Raises:
+        BadValue: If it has them with other entries, as a version of this project before wrote
+            them.
+    """
+    if not all(key in features for key in columns.features):
+        return False
+    for key, spec in columns.features.items():
+        if list(features[key]["names"] or ()) != spec["names"]:
+            raise BadValue(
+                f"'{root}' was recorded by another version: its column '{key}' has the entries "
+                f"{', '.join(features[key]['names'] or ())}, and not {', '.join(spec['names'])}. "
+                "Begin a new dataset"
+            )
+    return True
 
 
 def _feature(dtype: str, names: Iterable[str]) -> dict:

@@ -22,6 +22,7 @@ FACTS_DIR = Path("meta") / "xop"
 EPISODES_FILE = FACTS_DIR / "episodes.jsonl"
 CONFIG_FILE = FACTS_DIR / "config.json"
 FACTS_PREFIX = "xop/"
+_JSON_FACTS = ("versions", "settings", "changes")
 _PACKAGES = ("lerobot_teleoperator_xop", "lerobot", "mujoco", "mink", "numpy", "onnxruntime")
 
 
@@ -46,6 +47,10 @@ class EpisodeFacts:
         real_fps: Frames per second of the host clock; in real time it should be the dataset's.
         dropped_frames: Video frames that the encoder dropped; the pictures after one are shifted.
         late: Whether a real-time episode ran at less than 95 % of its rate.
+        settings: What was in force at the first frame (preset, weights, targets, body,
+            constraints, mode), as JSON; an empty object where no teleoperator drove.
+        changes: What changed in the course of it, as a JSON list of objects: `frame`, `time` of
+            the robot's clock [s], `source` and `change`.
     """
 
     success: bool
@@ -64,16 +69,23 @@ class EpisodeFacts:
     real_fps: float
     dropped_frames: int
     late: bool
+    settings: str = "{}"
+    changes: str = "[]"
 
     def to_metadata(self) -> dict[str, Any]:
         """Return the facts as columns of LeRobot's episode metadata."""
         return {f"{FACTS_PREFIX}{key}": value for key, value in dataclasses.asdict(self).items()}
 
 
+FACT_COLUMNS = tuple(f"{FACTS_PREFIX}{each.name}" for each in dataclasses.fields(EpisodeFacts))
+"""Names of the facts in LeRobot's episode metadata."""
+
+
 def append_facts(root: Path, episode: int, length: int, facts: EpisodeFacts) -> None:
     """Add the line of `episode`, which has `length` frames, and see it on the disk."""
     row = {"episode_index": episode, "length": length, **dataclasses.asdict(facts)}
-    row["versions"] = json.loads(facts.versions)
+    for name in _JSON_FACTS:
+        row[name] = json.loads(row[name])
     path = root / EPISODES_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:

@@ -7,6 +7,7 @@ and teleoperator meet (`xop_lerobot.link`), so the loops need not know of it.
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 import time
@@ -18,10 +19,10 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from xop_lerobot.dataset import durability
-from xop_lerobot.dataset.columns import Columns, is_own_column
+from xop_lerobot.dataset.columns import Columns, has_all_columns, is_own_column
 from xop_lerobot.dataset.embedding import skip_embedding
 from xop_lerobot.dataset.facts import (
-    FACTS_PREFIX,
+    FACT_COLUMNS,
     EpisodeFacts,
     append_facts,
     compute_config_hash,
@@ -29,6 +30,7 @@ from xop_lerobot.dataset.facts import (
     write_config,
 )
 from xop_lerobot.dataset.shutdown import hold_signals
+from xop_lerobot.dataset.tally import Tally
 from xop_lerobot.dataset.video_queue import VideoQueue
 from xop_lerobot.errors import XopError
 from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
@@ -57,23 +59,6 @@ class WrongFps(XopError, ValueError):
             f"the robot runs at {robot_fps} Hz (--robot.fps) and the dataset at {dataset_fps} Hz "
             f"(--dataset.fps); they must be equal. Use --dataset.fps={robot_fps}"
         )
-
-
-class _Tally:
-    """What is counted over the frames of one episode."""
-
-    def __init__(self) -> None:
-        self.frames = 0
-        self.start_time = 0.0
-        self.last = self.first = 0.0
-        self.success = self.fallen = self.collision = self.finished = False
-        self.task = ""
-
-    @property
-    def fps(self) -> float:
-        """Frames per second of the host clock, 0 for a single frame."""
-        span = self.last - self.first
-        return (self.frames - 1) / span if span > 0 else 0.0
 
 
 class XopDataset(LeRobotDataset):
@@ -137,13 +122,14 @@ class XopDataset(LeRobotDataset):
         Raises:
             LinkError: If the session has no robot, or more than one.
             WrongFps: If the robot runs at another rate.
+            BadValue: If its columns are those of another version.
         """
         info = get_session(cls.session_name).robot
         dataset = cast("Self", super().resume(repo_id, root=root, **options))
         if dataset.fps != info.fps:
             raise WrongFps(info.fps, dataset.fps)
         columns = Columns(info)
-        has_columns = all(key in dataset.meta.features for key in columns.features)
+        has_columns = has_all_columns(dataset.meta.features, columns, dataset.root)
         if not has_columns and cls.extra_columns:
             logger.warning(
                 "'%s' was recorded without the operator's columns; new episodes have none either.",
@@ -152,7 +138,7 @@ class XopDataset(LeRobotDataset):
         dataset._begin_session(info, columns if has_columns else None, options)
         episodes = dataset.meta.episodes
         if episodes is not None and len(episodes) > 0:
-            dataset._keep_facts = f"{FACTS_PREFIX}success" in episodes.column_names
+            dataset._keep_facts = set(FACT_COLUMNS) <= set(episodes.column_names)
         return dataset
 
     def _begin_session(
@@ -162,7 +148,7 @@ class XopDataset(LeRobotDataset):
         self._info, self._columns = info, columns
         self._create_options = options
         self._keep_facts, self._own_root = True, False
-        self._tally = _Tally()
+        self._tally = Tally()
         self._tick_limit: int | None = None
         self._stop_on_success = False
         self._events: MutableMapping[str, bool] = {}
@@ -232,6 +218,8 @@ class XopDataset(LeRobotDataset):
             self._video.wait()
         tally.task = str(frame["task"])
         super().add_frame(frame)
+        if tick is not None:
+            tally.note_changes(tick)
 
         tally.last = time.perf_counter()
         if tally.frames == 0:
@@ -294,7 +282,7 @@ class XopDataset(LeRobotDataset):
             shutil.rmtree(self.root, ignore_errors=True)
 
     def _begin_next(self, index: int) -> None:
-        self._tally = _Tally()
+        self._tally = Tally()
         self._session.begin_episode(index)
 
     def _secure(self) -> None:
@@ -329,6 +317,8 @@ class XopDataset(LeRobotDataset):
             start_time=tally.start_time,
             real_fps=tally.fps,
             dropped_frames=self._video.dropped,
+            settings=json.dumps(tally.settings),
+            changes=json.dumps(tally.changes),
             late=info.realtime and tally.frames > 1 and tally.fps < _LATE * info.fps,
         )
 

@@ -1,0 +1,47 @@
+"""What is counted over the frames of one episode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from xop_lerobot.link import TickRecord
+
+
+class Tally:
+    """Counts, times and flags of the episode that is being recorded.
+
+    Attributes:
+        frames: Frames so far.
+        start_time: Host clock at the first frame [s since the epoch].
+        first: Performance counter at the first frame [s].
+        last: The same at the last frame [s].
+        success: Whether the task is accomplished.
+        fallen: Whether the robot fell.
+        collision: Whether it touched anything but the ground.
+        finished: Whether the operator's recording has played out.
+        task: The task in words.
+        settings: What was in force at the first frame.
+        changes: What came into force, and with which frame.
+    """
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.start_time = 0.0
+        self.last = self.first = 0.0
+        self.success = self.fallen = self.collision = self.finished = False
+        self.task = ""
+        self.settings: dict[str, Any] = {}
+        self.changes: list[dict[str, Any]] = []
+
+    def note_changes(self, tick: TickRecord) -> None:
+        """Take down what came into force with the frame that is being added."""
+        if self.frames == 0:
+            self.settings = dict(tick.settings)
+        for change in tick.changes:
+            self.changes.append({"frame": self.frames, "time": tick.state.time, **change.to_dict()})
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of the host clock, 0 for a single frame."""
+        span = self.last - self.first
+        return (self.frames - 1) / span if span > 0 else 0.0
