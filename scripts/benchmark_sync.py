@@ -19,7 +19,7 @@ import numpy as np
 
 import xop_lerobot.low_level.falcon  # noqa: F401 registers the policy
 from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.low_level.policy import LowLevelPolicy, make_policy
+from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop

@@ -63,9 +63,9 @@ class SensorFilter:
         return np.sqrt(self._variance)
 
     @property
-    def position_noise(self) -> float:
-        """Observed standard deviation of a measured position of the base [m]."""
-        return float(np.sqrt(self._noise[0]))
+    def base_noise(self) -> tuple[float, float]:
+        """Observed standard deviation of a measured position [m] and heading [rad] of the base."""
+        return float(np.sqrt(self._noise[0])), float(np.sqrt(self._noise[5]))
 
     def update(
         self, qpos: np.ndarray, qvel: np.ndarray, variance: np.ndarray, dt: float
@@ -98,7 +98,7 @@ class SensorFilter:
             fresh[:3] = fresh[5] = False
         self._held = qpos[:3].copy()
         lost = self._find_lost(error, predicted, fresh)
-        self._observe_noise(error, fresh & ~lost)
+        self._observe_noise(error, variance * (dt * dt), fresh & ~lost)
         gain = np.where(fresh, predicted / (predicted + self._noise), 0.0)
         gain[lost] = 1.0
         step = gain * error
@@ -114,14 +114,14 @@ class SensorFilter:
         self._innovation[:] = self._trend[:] = 0
         self._is_new = False
 
-    def _observe_noise(self, error: np.ndarray, fresh: np.ndarray) -> None:
+    def _observe_noise(self, error: np.ndarray, carried: np.ndarray, fresh: np.ndarray) -> None:
         """Follow the white noise of each sensor by what differs from one sample to the next."""
         low, high = _NOISE_RANGE
-        difference = 0.5 * np.square(error - self._innovation) / self._configured
+        difference = 0.5 * (np.square(error - self._innovation) - carried) / self._configured
         for group in _GROUPS:
             if not fresh[group].all() or not difference[group].size:
                 continue
-            seen = self._configured[group] * min(float(difference[group].mean()), high**2)
+            seen = self._configured[group] * np.clip(difference[group].mean(), 0.0, high**2)
             noise = (1 - _LEARNING) * self._noise[group] + _LEARNING * seen
             self._noise[group] = np.maximum(noise, low**2 * self._configured[group])
         self._innovation = np.where(fresh, error, self._innovation)

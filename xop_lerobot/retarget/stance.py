@@ -98,13 +98,13 @@ class StanceMemory:
         )
         return abs(height) < self.config.lost_height and tilt < self.config.lost_tilt
 
-    def remember(self, places: np.ndarray, dt: float, noise: float) -> None:
+    def remember(self, places: np.ndarray, dt: float, noise: tuple[float, float]) -> None:
         """Take the feet of the filtered measurement into the mean of their places.
 
         Args:
             places: x, y [m] and heading [rad] of every contact. Shape (contacts, 3).
             dt: Time since the last one [s].
-            noise: Standard deviation of a measured position [m].
+            noise: Standard deviations of a measured position [m] and heading [rad] of the base.
         """
         for index in self.active:
             stood = self._stood[index]
@@ -115,14 +115,10 @@ class StanceMemory:
             change = places[index] - self.places[index]
             change[2] = math.remainder(change[2], 2 * math.pi)
             self.places[index] += share * change
-            config = self.config
-            # Headings of feet and base are as noisy to each other as places and position.
-            self._spread[index] = (
-                math.hypot(config.stance_position, noise * math.sqrt(share)),
-                math.hypot(
-                    config.stance_heading,
-                    config.heading * noise / config.position * math.sqrt(share),
-                ),
+            best = (self.config.stance_position, self.config.stance_heading)
+            self._spread[index] = tuple(
+                math.hypot(least, one * math.sqrt(share))
+                for least, one in zip(best, noise, strict=True)
             )
 
     def compute_std(self) -> list[np.ndarray]:
