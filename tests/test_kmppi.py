@@ -205,6 +205,56 @@ def test_effective_samples_range_from_one_to_all():
     assert compute_effective_samples(np.full(8, 1 / 8)) == pytest.approx(8)
 
 
+def find_weights_slowly(costs: np.ndarray, wanted: float) -> np.ndarray:
+    """Bisection on log λ, to the last bit."""
+    excess = costs - costs.min()
+    low, high = -300.0, np.log(1e4 * excess.max())
+    for _ in range(200):
+        middle = (low + high) / 2
+        weights = np.exp(-excess / np.exp(middle))
+        weights /= weights.sum()
+        low, high = (middle, high) if 1 / (weights @ weights) < wanted else (low, middle)
+    return weights
+
+
+COSTS = {
+    "exponential": lambda rng, k: rng.exponential(size=k),
+    "squared distances": lambda rng, k: 3 + np.square(rng.standard_normal((k, 7))).sum(1),
+    "over four orders of magnitude": lambda rng, k: np.exp(2 * rng.standard_normal(k)),
+    "over fifty": lambda rng, k: np.exp(30 * rng.standard_normal(k)),
+    "with one diverged": lambda rng, k: np.append(rng.exponential(size=k - 1), 1e12),
+    "two far from the others": lambda rng, k: np.append(1e5 + rng.exponential(size=k - 2), [0, 1]),
+    "equal but for one": lambda rng, k: np.append(np.ones(k - 1), 0.5),
+}
+
+
+@pytest.mark.parametrize("kind", COSTS)
+@pytest.mark.parametrize("num_samples", [3, 12, 30, 128])
+@pytest.mark.parametrize("wanted", [1.2, 4.0, 10.0, 100.0])
+def test_the_effective_sample_size_is_found_as_by_bisection(kind, num_samples, wanted):
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        costs = COSTS[kind](rng, num_samples)
+        weights = compute_weights(costs, make_config(effective_samples=wanted))
+        expected = find_weights_slowly(costs, min(wanted, 0.99 * num_samples))
+        size = compute_effective_samples(expected)
+        assert compute_effective_samples(weights) == pytest.approx(size, rel=1e-5)
+        # Where the size hardly depends on λ, the weights are less certain than the size.
+        np.testing.assert_allclose(weights, expected, atol=1e-5 if kind != "over fifty" else 1e-3)
+
+
+def test_a_diverged_sample_does_not_level_the_others():
+    costs = np.append(np.random.default_rng(0).exponential(size=29), 1e12)
+    weights = compute_weights(costs, make_config(effective_samples=4.0))
+    np.testing.assert_allclose(weights[:29], compute_weights(costs[:29], make_config()), atol=1e-5)
+
+
+def test_more_ties_for_the_best_than_wanted_count_alike():
+    costs = np.append(np.ones(6), [2.0, 3.0, 1e6])
+    weights = compute_weights(costs, make_config(effective_samples=4.0))
+    np.testing.assert_allclose(weights, np.append(np.full(6, 1 / 6), np.zeros(3)))
+
+
 @weightings
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_costs_that_are_not_finite_get_no_weight(weighting, bad):
@@ -254,7 +304,7 @@ def test_converges_on_a_quadratic(weighting, num_knots):
         kmppi.update(samples, np.square(samples.commands - target).sum((1, 2)))
         errors.append(np.abs(kmppi.commands - [0.4, HIGH[1]]).max())
     assert errors[0] > 1.0
-    assert errors[-1] < (0.02 if num_knots == 1 else 0.06)
+    assert errors[-1] < (0.02 if num_knots == 1 else 0.1)
 
 
 # -- parameters ----------------------------------------------------------------------------

@@ -80,6 +80,10 @@ class TorchNormals:
     def standard_normal(self, shape):
         return torch.randn(*shape, dtype=torch.double).numpy()
 
+    @property
+    def bit_generator(self):  # the other samplings draw from here
+        return np.random.PCG64(0)
+
 
 def record_theirs(case: Case) -> list[dict[str, np.ndarray]]:
     bound = torch.full((ENTRIES,), case.bound, dtype=torch.double)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from xop_lerobot.errors import BadShape
@@ -48,7 +50,9 @@ class Kmppi(SamplingOptimizer):
         self._interpolation = self._compute_interpolation(np.arange(horizon))
         self._shifts: dict[float, np.ndarray] = {}
         self._moved: np.ndarray | None = None
-        self._low, self._high = np.tile(self.low, num_knots), np.tile(self.high, num_knots)
+        # One support value held over the horizon needs no interpolation.
+        self._constant = num_knots == 1 and config.kernel_mean == "hold"
+        self._low, self._high = self.low[:, None], self.high[:, None]
         self._draw = DRAWS[config.sampling]
 
     def _compute_interpolation(self, times: np.ndarray) -> np.ndarray:
@@ -79,7 +83,7 @@ class Kmppi(SamplingOptimizer):
     @property
     def commands(self) -> np.ndarray:
         """The planned sequence. Shape (T, k)."""
-        return np.clip(self.nominal, self.low, self.high)
+        return np.minimum(np.maximum(self.nominal, self.low), self.high)
 
     def shift(self, steps: float) -> None:
         """Move the plan on by `steps` control steps.
@@ -87,6 +91,8 @@ class Kmppi(SamplingOptimizer):
         Past its end the last value is held, or, with a kernel of zero mean, fades; until the
         next update the original then has the old sequence moved on by whole steps, and zeros.
         """
+        if self._constant:
+            return
         if self.config.shift == "one":
             steps = 1
         if self.config.kernel_mean == "zero":
@@ -123,56 +129,64 @@ class Kmppi(SamplingOptimizer):
             K samples within the bounds.
         """
         total, (num_knots, entries) = self.config.num_samples, self.knots.shape
-        if np.shape(noise_std) not in {(entries,), (num_knots, entries)}:
-            raise BadShape("noise_std", (entries,), np.shape(noise_std))
+        if noise_std.shape not in ((entries,), (num_knots, entries)):
+            raise BadShape("noise_std", (entries,), noise_std.shape)
         if candidates.ndim != 2 or candidates.shape[1] != entries:
             raise BadShape("candidates", f"(c, {entries})", candidates.shape)
-        knots = np.empty((total, num_knots, entries))
+        knots = np.empty((num_knots, entries, total))  # samples last: long inner loops
         fixed = int(self.config.sample_plan)
-        knots[:fixed] = self.knots
-        candidates = candidates[: total - fixed]
-        knots[fixed : fixed + len(candidates)] = candidates[:, None]
-        fixed += len(candidates)
+        if fixed:
+            knots[..., 0] = self.knots
+        if len(candidates):
+            candidates = candidates[: total - fixed]
+            knots[..., fixed : fixed + len(candidates)] = candidates.T
+            fixed += len(candidates)
         if fixed < total:
             noise = self._draw(rng, (total - fixed, num_knots, entries))
-            np.multiply(noise, noise_std, out=noise)
-            np.add(noise, self.knots, out=knots[fixed:])
-        rows = knots.reshape(total, -1)
-        np.maximum(rows, self._low, out=rows)
-        np.minimum(rows, self._high, out=rows)
+            free = knots[..., fixed:]
+            np.multiply(noise.transpose(1, 2, 0), noise_std[..., None], out=free)
+            np.add(free, self.knots[..., None], out=free)
+        np.maximum(knots, self._low, out=knots)
+        np.minimum(knots, self._high, out=knots)
         commands = self._interpolate(knots)
         penalty = None
         if self.config.importance_cost:
             penalty = self._compute_importance(commands, noise_std)
-        return Samples(knots, commands, penalty)
+        return Samples(knots.transpose(2, 0, 1), commands.transpose(2, 0, 1), penalty)
 
     def _interpolate(self, knots: np.ndarray) -> np.ndarray:
-        """Command sequences of support values, (K, S, k) -> (K, T, k), as one product."""
-        total, num_knots, entries = knots.shape
-        columns = knots.transpose(1, 0, 2).reshape(num_knots, -1)
-        free = (self._interpolation @ columns).reshape(self.horizon, total, entries)
-        commands = np.empty((total, self.horizon, entries))
-        np.maximum(free.transpose(1, 0, 2), self.low, out=commands)
-        np.minimum(commands, self.high, out=commands)
+        """Command sequences of support values, (S, k, K) -> (T, k, K), as one product."""
+        num_knots, entries, total = knots.shape
+        if self._constant:
+            commands = np.empty((self.horizon, entries, total))
+            commands[:] = knots
+            return commands
+        free = self._interpolation.dot(knots.reshape(num_knots, -1))
+        commands = free.reshape(self.horizon, entries, total)
+        np.maximum(commands, self._low, out=commands)
+        np.minimum(commands, self._high, out=commands)
         return commands
 
     def _compute_importance(self, commands: np.ndarray, noise_std: np.ndarray) -> np.ndarray:
         r"""MPPI's importance sampling: :math:`\lambda\sum_t U_t^\top\Sigma^{-1}(A_t-U_t)`. (K,)."""
         nominal = self.nominal
-        std = np.broadcast_to(noise_std, self.knots.shape)[0]
-        precision = np.where(std > 0, 1 / np.square(np.where(std > 0, std, 1.0)), 0.0)
+        variance = np.square(noise_std if noise_std.ndim == 1 else noise_std[0])
+        # An entry without noise has no density; it costs nothing.
+        precision = np.divide(1.0, variance, where=variance > 0, out=np.zeros_like(variance))
         gain = self.config.temperature * nominal * precision
-        return (commands - nominal).reshape(len(commands), -1) @ gain.ravel()
+        deviation = commands - nominal[..., None]
+        return gain.ravel().dot(deviation.reshape(gain.size, -1))
 
     def update(self, samples: Samples, costs: np.ndarray) -> np.ndarray:
         """Move the plan to the weighted mean of the samples. Returns the weights, shape (K,)."""
-        if np.shape(costs) != (len(samples.knots),):
-            raise BadShape("costs", (len(samples.knots),), np.shape(costs))
+        if costs.shape != (len(samples.knots),):
+            raise BadShape("costs", (len(samples.knots),), costs.shape)
         weights = self._weigh(costs if samples.penalty is None else costs + samples.penalty)
-        mean = weights @ samples.knots.reshape(len(weights), -1)
-        if not np.isfinite(mean).all():  # a sample that is not finite got in with weight 0
+        rows = samples.knots.transpose(1, 2, 0).reshape(-1, len(weights))
+        mean = rows.dot(weights)
+        if not math.isfinite(mean.sum()):  # a sample that is not finite got in with weight 0
             used = weights > 0
-            mean = weights[used] @ samples.knots[used].reshape(used.sum(), -1)
+            mean = rows[:, used].dot(weights[used])
         self.knots, self._moved = mean.reshape(self.knots.shape), None
         return weights
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from xop_lerobot.retarget.config import MpcConfig
 
-_TOLERANCE = 1e-9  # of the logarithm of the effective sample size
+_TOLERANCE = 1e-6  # of the logarithm of the effective sample size
+_LEAST_SPAN = 1e-290  # costs nearer to each other than that are the same
 _MAX_ITERATIONS = 100
 
 
@@ -26,48 +27,57 @@ def compute_weights(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
     Returns:
         Weights. Shape (K,). All on the first sample (the standing plan) if no cost is finite.
     """
-    finite = np.isfinite(costs)
-    if not finite.all():
-        weights = np.zeros(len(costs))
-        if finite.any():
-            weights[finite] = compute_weights(costs[finite], config)
-        else:
-            weights[0] = 1.0
-        return weights
-    excess = costs - costs.min()
-    span = float(excess.max())
-    if span <= np.finfo(float).tiny:
-        return np.full(len(costs), 1 / len(costs))
-    if config.weighting == "ess":
-        return _compute_ess_weights(excess, span, config.effective_samples)
-    temperature = config.temperature * (span if config.weighting == "minmax" else 1.0)
+    if math.isfinite(float(costs.sum())):  # so they all are, in one look
+        return _weigh_finite(costs, config)
+    weights, finite = np.zeros(len(costs)), np.isfinite(costs)
+    if finite.any():
+        weights[finite] = _weigh_finite(costs[finite], config)
+    else:
+        weights[0] = 1.0
+    return weights
+
+
+def _weigh_finite(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
+    excess = costs - costs[costs.argmin()]
+    temperature = config.temperature
+    if config.weighting != "raw":
+        span = float(excess[excess.argmax()])
+        if span < _LEAST_SPAN:
+            return np.full(len(costs), 1 / len(costs))
+        if config.weighting == "ess":
+            return _compute_ess_weights(excess, span, config.effective_samples)
+        temperature *= span
     weights = np.exp(excess * (-1 / temperature))
     weights *= 1 / weights.sum()
     return weights
 
 
 def _compute_ess_weights(excess: np.ndarray, span: float, wanted: float) -> np.ndarray:
-    r"""Weights of the wanted effective sample size, or the nearest to it that there is.
+    r"""Weights of the wanted effective sample size; those alike that tie, if more tie for best.
 
     Newton's method for :math:`f(s) = \log n(e^s) - \log n^*` with the sample size
     :math:`n(\lambda) = (\sum e_i)^2 / \sum e_i^2`, :math:`e_i = \exp(-x_i/\lambda)`, whose
     derivative :math:`f' = \frac{2}{\lambda}(\frac{\sum x_i e_i}{\sum e_i} -
-    \frac{\sum x_i e_i^2}{\sum e_i^2})` is never negative; a step out of the bracket
-    :math:`\lambda \in [10^{-6}, 10^3]\,\max x` halves it instead.
+    \frac{\sum x_i e_i^2}{\sum e_i^2})` is never negative; a step out of the bracket halves
+    it instead. The bracket is in units of the n-th best, so that no bad sample widens it.
     """
     count = len(excess)
     wanted = min(wanted, 0.99 * count)
     rank = min(math.ceil(wanted), count) - 1
-    low, high = math.log(1e-6 * span), math.log(1e3 * span)
-    # With costs spread evenly, half the excess of the n-th best is the answer.
-    guess = 0.5 * float(np.partition(excess, rank)[rank])
-    position = math.log(guess) if guess > 1e-6 * span else 0.5 * (low + math.log(span))
+    nth_best = float(np.partition(excess, rank)[rank])
+    if nth_best < _LEAST_SPAN:
+        tied = excess < _LEAST_SPAN
+        return tied / tied.sum()
+    position = math.log(0.5 * nth_best)  # the answer if costs are spread evenly
+    low, high = position - 60.0, math.log(1e3 * span)
     target = math.log(wanted)
+    basis = np.empty((2, count))
+    basis[0], basis[1] = 1.0, excess
     for _ in range(_MAX_ITERATIONS):
         temperature = math.exp(position)
         weights = np.exp(excess * (-1 / temperature))
-        weighted = excess * weights
-        total, squares = float(weights.sum()), float(weights @ weights)
+        total, first = basis.dot(weights).tolist()
+        squares, second = basis.dot(weights * weights).tolist()
         miss = 2 * math.log(total) - math.log(squares) - target
         if abs(miss) < _TOLERANCE or high - low < _TOLERANCE:
             break
@@ -75,9 +85,8 @@ def _compute_ess_weights(excess: np.ndarray, span: float, wanted: float) -> np.n
             low = position
         else:
             high = position
-        slope = 2 * (float(weighted.sum()) / total - float(weighted @ weights) / squares)
-        step = -miss * temperature / slope if slope > 0 else math.inf
-        position += step
+        slope = 2 * (first / total - second / squares) / temperature
+        position = position - miss / slope if slope > 0 else high
         if not low < position < high:
             position = 0.5 * (low + high)
     weights *= 1 / total

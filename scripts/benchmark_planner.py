@@ -1,0 +1,25 @@
+"""Print the planner's own time per solve beside that of pytorch_mppi's KMPPI.
+
+    python scripts/benchmark_planner.py --repeats 500
+
+Medians of interleaved solves on one thread, without physics and policy. Needs the extra `dev`.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from xop_lerobot.evaluation.planner import make_planner_table, measure_planners
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeats", type=int, default=300, help="solves per planner and row")
+    parser.add_argument("--seed", type=int, default=0)
+    settings = parser.parse_args()
+    print(make_planner_table(measure_planners(repeats=settings.repeats, seed=settings.seed)))
+
+
+if __name__ == "__main__":
+    main()
