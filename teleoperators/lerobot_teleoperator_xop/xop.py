@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import weakref
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from lerobot.teleoperators.teleoperator import Teleoperator
 
 from lerobot_teleoperator_xop.config_xop import XopConfig
+from xop_lerobot.control.protocol import find_socket
 from xop_lerobot.dataset.host import Host
-from xop_lerobot.errors import LinkError, NotConnected
+from xop_lerobot.errors import LinkError, NotConnected, XopError
 from xop_lerobot.link import RobotInfo, get_session
 from xop_lerobot.mistakes import report_mistakes
 from xop_lerobot.operator.devices import make_device
 
 if TYPE_CHECKING:
+    from lerobot.utils.keyboard_input import TerminalKeyListener
+
+    from xop_lerobot.control.server import ControlServer
     from xop_lerobot.teleoperation import Teleoperation
 
 
@@ -43,6 +48,9 @@ class Xop(Teleoperator):
         self._teleoperation: Teleoperation | None = None
         self._is_connected = False
         self._resets_seen = 0
+        self._control_path = find_socket(config.control, config.session)
+        self._control: ControlServer | None = None
+        self._keys: TerminalKeyListener | None = None
         # Refuses a bad device here, before a robot or a dataset exists.
         device = make_device(config.device)
         self._session.configs["teleop"] = {"type": self.name, **dataclasses.asdict(config)}
@@ -102,7 +110,59 @@ class Xop(Teleoperator):
             device = make_device(self.config.device)
             device.connect()
             device.disconnect()
+        try:
+            self._open_control()
+        except BaseException:
+            self.disconnect()
+            raise
         self._is_connected = True
+
+    def _open_control(self) -> None:
+        """Listen for changes at the socket and at the terminal, where the flags ask for it."""
+        if self._control_path is not None:
+            from xop_lerobot.control.server import ControlServer  # noqa: PLC0415
+
+            self._control = ControlServer(self._control_path, self)
+        if self.config.keys:
+            from lerobot_teleoperator_xop.terminal import listen_to_terminal  # noqa: PLC0415
+
+            self._keys = listen_to_terminal(self)
+
+    @property
+    def has_keys(self) -> bool:
+        """Whether this teleoperator reads the keys of the terminal itself."""
+        return self._keys is not None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What is in force: preset, weights, targets, constraints, mode.
+
+        Raises:
+            XopError: If no robot is driven yet.
+        """
+        return self._driving.settings
+
+    def change(self, change: Mapping[str, Any], source: str = "call") -> dict[str, Any]:
+        """Ask for other settings, from any thread; see `Teleoperation.change`.
+
+        Raises:
+            XopError: If the change is not valid, or no robot is driven yet.
+        """
+        return self._driving.change(change, source)
+
+    def toggle(self, name: str, source: str = "call") -> dict[str, Any]:
+        """Toggle the mode, a constraint or a preset; see `Teleoperation.toggle`.
+
+        Raises:
+            XopError: If there is nothing of this name, or no robot is driven yet.
+        """
+        return self._driving.toggle(name, source)
+
+    @property
+    def _driving(self) -> Teleoperation:
+        if self._teleoperation is None:
+            raise XopError("no robot is driven yet; try again when it stands")
+        return self._teleoperation
 
     def _make_teleoperation(self, info: RobotInfo) -> Teleoperation:
         from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig  # noqa: PLC0415
@@ -146,6 +206,12 @@ class Xop(Teleoperator):
 
     def disconnect(self) -> None:
         """Close the device and leave LeRobot as it was; may be called twice."""
+        if self._control is not None:
+            self._control.close()
+            self._control = None
+        if self._keys is not None:
+            self._keys.stop()
+            self._keys = None
         if self._teleoperation is not None:
             self._teleoperation.disconnect()
             self._teleoperation = None

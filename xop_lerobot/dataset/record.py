@@ -44,6 +44,7 @@ from lerobot.utils.visualization_utils import (
 
 from lerobot_robot_xop import XopRobotConfig
 from lerobot_teleoperator_xop import XopConfig
+from lerobot_teleoperator_xop.terminal import listen_while_recording
 from xop_lerobot.dataset.host import count_ticks
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
 from xop_lerobot.dataset.xop_dataset import XopDataset
@@ -176,7 +177,10 @@ def record_episodes(
     """Connect both devices and record into `dataset`."""
     teleop.connect()
     robot.connect()
-    listener, events = init_keyboard_listener()
+    if teleop.config.keys and not teleop.has_keys:
+        listener, events = listen_while_recording(teleop)
+    else:
+        listener, events = init_keyboard_listener()
     try:
         with VideoEncodingManager(dataset):
             Recording(config, robot, teleop, dataset, events).run()

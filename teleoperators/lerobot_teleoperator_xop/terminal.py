@@ -1,0 +1,67 @@
+"""Keys of the terminal, where LeRobot's commands do not read them themselves."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+
+from lerobot.utils.keyboard_input import (
+    TerminalKeyListener,
+    apply_recording_control,
+    create_key_listener,
+    pynput_can_capture,
+)
+
+from xop_lerobot.control.keys import HELP, Target, press
+from xop_lerobot.dataset.host import RECORD_MODULE, ROLLOUT_MODULE, find
+
+logger = logging.getLogger(__name__)
+
+_RECORDING_KEYS = {
+    "right": "right", "n": "right", "left": "left", "r": "left", "esc": "esc", "q": "esc",
+}  # fmt: skip
+
+
+def listen_to_terminal(target: Target) -> TerminalKeyListener | None:
+    """Let keys of this terminal change `target`; None where they can't be read.
+
+    Without a display LeRobot's record and rollout commands read the terminal themselves, and
+    two readers would take each other's keys. `xop-record` shares its reader instead.
+    """
+    taken = not pynput_can_capture() and (find(RECORD_MODULE) or find(ROLLOUT_MODULE))
+    if taken or not sys.stdin.isatty():
+        reason = "LeRobot reads this terminal" if taken else "this is no terminal"
+        logger.warning("--teleop.keys: %s; use xop-record, or --teleop.control.", reason)
+        return None
+
+    def on_key(key: str) -> None:
+        press(key, target)
+
+    listener = TerminalKeyListener(on_key)
+    listener.start()
+    logger.info("Keys: %s.", HELP)
+    return listener
+
+
+def listen_while_recording(target: Target) -> tuple[object | None, dict[str, bool]]:
+    """Read LeRobot's keys of a recording and those of the settings with one listener.
+
+    Returns:
+        The listener, which has `stop()`, or None; and the events that its keys set.
+    """
+    events = {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
+    help_text = f"Right/Left/Esc, or n=next, r=re-record, q=quit; {HELP}"
+    return create_key_listener(make_dispatch(target, events), controls_help=help_text), events
+
+
+def make_dispatch(target: Target, events: dict[str, bool]) -> Callable[[str], None]:
+    """Make what is called with the name of each key."""
+
+    def dispatch(key: str) -> None:
+        if key.lower() in _RECORDING_KEYS:
+            apply_recording_control(_RECORDING_KEYS[key.lower()], events)
+        else:
+            press(key, target)
+
+    return dispatch

@@ -1,0 +1,174 @@
+"""`xop-control`: change the settings of a running session from another terminal.
+
+xop-control --preset conservative --weights position=2 orientation=0.5
+xop-control --targets left_wrist --constraints upright=on
+xop-control --toggle upright
+xop-control                      # what is in force
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from xop_lerobot.control.protocol import MAX_LINE, find_socket, read_object, write_object
+from xop_lerobot.errors import BadValue, XopError
+
+_SWITCH = {"on": True, "true": True, "off": False, "false": False}
+
+
+class NoSession(XopError):
+    """Nobody listens at the control socket."""
+
+
+class Refused(XopError):
+    """The session has refused a request; the message says why, and nothing has changed."""
+
+
+class ControlClient:
+    """A connection to the control socket of a session.
+
+    Args:
+        path: Path of the socket.
+        timeout: Longest wait for an answer [s].
+
+    Raises:
+        NoSession: If nobody listens there.
+    """
+
+    def __init__(self, path: Path, timeout: float = 5.0) -> None:
+        self.path = path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket.settimeout(timeout)
+        try:
+            self._socket.connect(str(path))
+        except OSError as fault:
+            self._socket.close()
+            raise NoSession(
+                f"no session listens at '{path}' ({fault.strerror or fault}). Start it with "
+                "--teleop.control=true, and name it with --session or --socket"
+            ) from fault
+        self._lines = self._socket.makefile("rb")
+
+    def request(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Send a request; return the settings that hold from the next tick on.
+
+        Raises:
+            Refused: If it is refused; says why.
+            NoSession: If the session has ended meanwhile.
+        """
+        try:
+            self._socket.sendall(write_object(request))
+            line = self._lines.readline(MAX_LINE)
+        except OSError as fault:
+            raise NoSession(f"the session at '{self.path}' does not answer: {fault}") from fault
+        if not line:
+            raise NoSession(f"the session at '{self.path}' has ended")
+        reply = read_object(line)
+        if not reply.get("ok"):
+            raise Refused(str(reply.get("error", "refused")))
+        return reply["settings"]
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._lines.close()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def parse_pairs(kind: str, pairs: Sequence[str]) -> dict[str, str]:
+    """Read `name=value` pairs.
+
+    Raises:
+        BadValue: If one has no `=`.
+    """
+    values = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not (name and equals and value):
+            raise BadValue(f"--{kind} takes name=value, got {pair!r}")
+        values[name] = value
+    return values
+
+
+def build_request(flags: argparse.Namespace) -> dict[str, Any]:
+    """Build the request that the flags ask for.
+
+    Raises:
+        BadValue: If a value is neither a number nor a switch where it must be.
+    """
+    request: dict[str, Any] = {
+        name: getattr(flags, name)
+        for name in ("preset", "variant", "mode", "targets", "body", "toggle")
+        if getattr(flags, name) is not None
+    }
+    if flags.weights:
+        request["weights"] = {
+            name: _to_number(name, text)
+            for name, text in parse_pairs("weights", flags.weights).items()
+        }
+    if flags.constraints:
+        request["constraints"] = {
+            name: _to_switch(name, text)
+            for name, text in parse_pairs("constraints", flags.constraints).items()
+        }
+    return request or {"get": "settings"}
+
+
+def _to_number(name: str, text: str) -> float | str:
+    try:
+        return "inf" if text == "inf" else float(text)
+    except ValueError:
+        raise BadValue(f"weight {name!r} must be a number, got {text!r}") from None
+
+
+def _to_switch(name: str, text: str) -> bool:
+    if text.lower() not in _SWITCH:
+        raise BadValue(f"constraint {name!r} must be on or off, got {text!r}")
+    return _SWITCH[text.lower()]
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the flags."""
+    parser = argparse.ArgumentParser(
+        prog="xop-control",
+        description="Change the settings of a running session; without a change, show them.",
+    )
+    parser.add_argument("--session", default="default", help="--teleop.session of the session")
+    parser.add_argument("--socket", default="true", help="--teleop.control of the session")
+    parser.add_argument("--preset", help="default, conservative, aggressive or table1")
+    parser.add_argument("--weights", nargs="+", metavar="NAME=VALUE", help="cost weights")
+    parser.add_argument("--constraints", nargs="+", metavar="NAME=on|off", help="such as upright")
+    parser.add_argument("--variant", help="binding that the robot names, such as v2")
+    parser.add_argument("--targets", nargs="+", help="tracked frames to follow")
+    parser.add_argument("--body", nargs="*", help="what moves for them; none: all commands")
+    parser.add_argument("--mode", help="stationary or mobile")
+    parser.add_argument("--toggle", help="mode, a constraint, or a preset against default")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run `xop-control`; a refusal ends in one line and status 1."""
+    flags = make_parser().parse_args(arguments)
+    try:
+        path = find_socket(flags.socket, flags.session)
+        if path is None:
+            raise BadValue("--socket must be a path, or true for that of the session")
+        with ControlClient(path) as client:
+            print(json.dumps(client.request(build_request(flags)), indent=2))
+    except XopError as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()
