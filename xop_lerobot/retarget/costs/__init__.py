@@ -1,5 +1,6 @@
 """Cost terms of the controller, one file each (Eq. 3)."""
 
+from xop_lerobot.retarget.costs.change import ChangeCost
 from xop_lerobot.retarget.costs.collision import CollisionCost
 from xop_lerobot.retarget.costs.control import ControlCost
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
@@ -13,6 +14,7 @@ from xop_lerobot.retarget.costs.tracking import TrackingCost
 from xop_lerobot.retarget.costs.upright import UprightCost
 
 __all__ = [
+    "ChangeCost",
     "CollisionCost",
     "ControlCost",
     "Cost",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.costs.change import ChangeCost
 from xop_lerobot.retarget.costs.collision import CollisionCost
 from xop_lerobot.retarget.costs.control import ControlCost
 from xop_lerobot.retarget.costs.cost import Cost
@@ -31,6 +32,7 @@ def make_costs(
         StanceCost(morphology.contact_groups, morphology.wheeled),
         collision,
         ControlCost((space.high - space.low) / 2),
+        ChangeCost((space.high - space.low) / 2),
         UprightCost(),
         SupportCost(support),
         LateralCost(command_model.is_nonholonomic),

@@ -1,0 +1,30 @@
+"""Cost of changing the command."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+
+
+class ChangeCost(Cost):
+    r"""Mean over steps of :math:`w_\Delta\|(a_k - a_{exec})/s\|^2`, s half the range of each entry.
+
+    :math:`a_{exec}` is the command that is being executed. What the paper's control energy is
+    for, smooth and slow motion, without its pull on a steady command.
+
+    Args:
+        scale: Half the range of each command entry. Shape (k,).
+    """
+
+    name = "change"
+
+    def __init__(self, scale: np.ndarray) -> None:
+        self.scale = scale
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        if not evaluation.weights.change:
+            return np.zeros(len(evaluation.commands))
+        change = (evaluation.commands - evaluation.executed) / self.scale
+        return evaluation.weights.change * np.square(change).sum(-1).mean(-1)
