@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ from xop_lerobot.transforms import (
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
+    quat_yaw,
 )
 
 K, H, NQ, NV, NA = 5, 4, 9, 8, 3
@@ -258,6 +260,12 @@ def test_excess_does_not_change_when_the_base_tilts_forward():
     )
 
 
+def to_base(qpos: np.ndarray, point: np.ndarray) -> np.ndarray:
+    yaw = float(quat_yaw(qpos[3:7]))
+    x, y = point[:2] - qpos[:2]
+    return np.array([math.cos(yaw) * x + math.sin(yaw) * y, math.cos(yaw) * y - math.sin(yaw) * x])
+
+
 def test_support_equals_its_formula():
     area, g = SupportArea(SQUARE, margin=0.05), 9.81
     e = make_evaluation()
@@ -270,6 +278,10 @@ def test_support_equals_its_formula():
         for k in range(1, H + 1):
             zmp = e.com[i, k, :2] - e.com[i, k, 2] / g * acceleration
             total += sum(area.compute_excess(e.qpos[i, k, :7], zmp) ** 2) / H
+        # Where the centre of mass comes to rest over a pivot, by its velocity over the base.
+        start, end = (to_base(e.qpos[i, k], e.com[i, k]) for k in (H - 3, H))
+        capture = end + math.sqrt(max(e.com[i, H, 2], 0) / g) * (end - start) / (3 * DT)
+        total += sum(area.compute_excess(base_at(0, 0, 0), capture) ** 2)
         total += sum(area.compute_excess(e.terminal_qpos[i, :7], e.terminal_com[i, :2]) ** 2)
         expected.append(WEIGHTS.support * total)
     np.testing.assert_allclose(SupportCost(area).compute(e), expected)
@@ -310,6 +322,28 @@ def test_braking_hard_tips_the_robot(acceleration, tips):
     )
     (cost,) = SupportCost(SupportArea(SQUARE, margin=0.05)).compute(e)
     assert (cost > 0) == tips
+
+
+@pytest.mark.parametrize("speed, tips", [(0.3, False), (1.0, True)])
+@pytest.mark.parametrize("driving", [False, True])
+def test_what_has_begun_to_tip_counts(speed, tips, driving):
+    """No acceleration, and inside the area still; but 1 m up it goes on by 0.32 s of its speed.
+
+    A robot that drives as fast as its centre of mass does not tip.
+    """
+    com = np.zeros((1, H + 1, 3))
+    com[0, :, 0], com[..., 2] = speed * np.arange(H + 1) * DT, 1.0
+    qpos = np.tile(base_at(0, 0, 0), (1, H + 1, 1))
+    if driving:
+        qpos[..., :2] = com[..., :2]
+    e = make_evaluation(
+        com=com,
+        qpos=qpos,
+        terminal_com=np.array([[0.0, 0, 1]]),
+        terminal_qpos=base_at(0, 0, 0)[None],
+    )
+    (cost,) = SupportCost(SupportArea(SQUARE, margin=0.05)).compute(e)
+    assert (cost > 0) == (tips and not driving)
 
 
 def test_a_horizon_of_one_step_has_no_acceleration():

@@ -16,7 +16,7 @@ from xop_lerobot.morphology.morphology import (
     Variant,
 )
 from xop_lerobot.morphology.rby1.links import LINKS
-from xop_lerobot.morphology.rby1.mpc import EFFECTS, HULL, PIVOT, SUPPORT, mpc_config
+from xop_lerobot.morphology.rby1.mpc import EFFECTS, HULL, PIVOT, SUPPORT, V2_CONFIG, mpc_config
 from xop_lerobot.retarget.config import PaperParameters
 
 if TYPE_CHECKING:
@@ -97,6 +97,7 @@ class RBY1(Morphology):
                 *(f"torso_{i}" for i in range(len(TORSO_READY))),
                 *(f"left_arm_{i}" for i in range(len(ARM_READY))),
             ),
+            configs=dict.fromkeys(Mode, V2_CONFIG),
             paper=dict.fromkeys(Mode, PaperParameters(50, 3, 0.01, 25.0)),
         ),
     }

@@ -51,6 +51,19 @@ CONFIGS = {
     ),
 }
 
+V2_CONFIG = MpcConfig(
+    num_samples=16,
+    horizon=8,
+    # The arm reaches where it can; the torso, which carries it, goes on slowly.
+    noise_std={
+        **{f"torso_{i}": 0.02 for i in range(6)},
+        **{f"left_arm_{i}": 0.05 for i in range(7)},
+    },
+    proposal_s=1.0,
+    weights=CostWeights(orientation=0.2),
+)
+"""Torso and left arm after the left hand; the base stands in either mode."""
+
 
 def mpc_config(mode: Mode) -> MpcConfig:
     """Parameters in `mode`."""

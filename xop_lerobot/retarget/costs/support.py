@@ -8,6 +8,7 @@ from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.transforms import quat_yaw
 
 GRAVITY = 9.81
+_VELOCITY_STEPS = 3  # control steps at the end of the horizon that give the velocity
 
 
 class SupportArea:
@@ -37,7 +38,11 @@ class SupportArea:
 
     def compute_excess(self, base: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Distances of points beyond each edge, 0 inside [m]. (..., 7), (..., 2) -> (..., c)."""
-        return np.maximum(_to_base(base, points) @ self._normals.T - self._offsets, 0)
+        return self.compute_excess_in_base(_to_base(base, points))
+
+    def compute_excess_in_base(self, places: np.ndarray) -> np.ndarray:
+        """`compute_excess` of places in the base's frame [m]. (..., 2) -> (..., c)."""
+        return np.maximum(places @ self._normals.T - self._offsets, 0)
 
     def compute_lean(self, base: np.ndarray, com: np.ndarray) -> np.ndarray:
         """Place of the centre of mass beyond the free circle about where it rests [m].
@@ -84,15 +89,21 @@ def _to_base(base: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 class SupportCost(Cost):
-    r"""Squared distance of the zero-moment point beyond the shrunk support area.
+    r"""Squared distances beyond the shrunk support area, of three points.
 
-    .. math:: z = c_{xy} - \frac{c_z}{g}\,\ddot c_{xy}
+    .. math::
+
+        z = c_{xy} - \frac{c_z}{g}\,\ddot c_{xy}, \qquad
+        \xi = c_{xy} + \sqrt{c_z / g}\;\dot c_{xy}
 
     with c the centre of mass and its acceleration the mean over the horizon, from finite
-    differences; and at the end of the extrapolation, where the robot shall be able to stand
-    still, the centre of mass itself. There its squared distance beyond a free circle about where
-    it rests counts too, with the weight `lean`: a mobile robot shall drive after its goal, not
-    bend. On flat ground the robot tips where z leaves the area (Vukobratović and Borovac, 2004).
+    differences. On flat ground the robot tips where the zero-moment point z leaves the area
+    (Vukobratović and Borovac, 2004). The horizon is too short to see a tipping that has begun:
+    ξ, at its end and with the velocity relative to the base, is where the centre of mass would
+    come to rest over a pivot if all joints stopped (the capture point; Pratt et al., 2006).
+    The third is the centre of mass itself at the end of the extrapolation, where the robot shall
+    be able to stand still. There its squared distance beyond a free circle about where it rests
+    counts too, with the weight `lean`: a mobile robot shall drive after its goal, not bend.
     The paper has no such term.
 
     Args:
@@ -115,9 +126,19 @@ class SupportCost(Cost):
             span = (velocity.shape[1] - 1) * dt
             acceleration = (velocity[:, -1] - velocity[:, 0]) / span
         zmp = com[..., :2] - com[..., 2:] / GRAVITY * acceleration[:, None]
-        moving = self.area.compute_excess(evaluation.qpos[:, 1:, :7], zmp)
+        excess = np.square(self.area.compute_excess(evaluation.qpos[:, 1:, :7], zmp)).sum(-1)
+        excess = excess.mean(-1) + np.square(self._compute_capture_excess(evaluation)).sum(-1)
         base, com = evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
-        resting = self.area.compute_excess(base, com)
-        excess = np.square(moving).sum(-1).mean(-1) + np.square(resting).sum(-1)
+        excess += np.square(self.area.compute_excess(base, com)).sum(-1)
         lean = np.square(self.area.compute_lean(base, com)).sum(-1)
         return evaluation.weights.support * excess + evaluation.weights.lean * lean
+
+    def _compute_capture_excess(self, evaluation: Evaluation) -> np.ndarray:
+        """Distances of the capture point beyond each edge at the end of the horizon. (K, c)."""
+        assert self.area is not None
+        steps = min(_VELOCITY_STEPS, evaluation.com.shape[1] - 1)
+        com, base = evaluation.com[:, -1 - steps :], evaluation.qpos[:, -1 - steps :, :7]
+        place = _to_base(base, com[..., :2])
+        velocity = (place[:, -1] - place[:, 0]) / (steps * evaluation.dt)
+        capture = place[:, -1] + np.sqrt(np.maximum(com[:, -1, 2:], 0) / GRAVITY) * velocity
+        return self.area.compute_excess_in_base(capture)
