@@ -125,15 +125,17 @@ def compute_step_metrics(
     Returns:
         ``arrival_s``, ``arrival_mean_s``: time from the step until the errors are first within
         the tolerance, infinite if never; ``at_limit_*``: error when it shall be there;
-        ``after_*``: from then on, as worst (``max``), 95th percentile and median.
+        ``after_*``: from then on, as worst (``max``), 95th percentile and median; ``final_*``:
+        the last. Those of the mean errors begin `WINDOW_S` later, when the whole window lies
+        behind the time to arrive.
     """
     since = (time >= step.start - 1e-9) & (time < end - 1e-9)
     limit = step.start + step.limit_s
-    after = since & (time >= limit - 1e-9)
     metrics = {}
     for label, mean in (("", False), ("mean_", True)):
         inside = since & errors.find_within(tolerance, mean=mean)
         metrics[f"arrival_{label}s"] = _first(time, inside) - step.start
+        after = since & (time >= limit + (WINDOW_S if mean else 0) - 1e-9)
         position = (errors.mean_position if mean else errors.position)[after] * 100
         angle = np.degrees((errors.mean_angle if mean else errors.angle)[after])
         for unit, values in (("cm", position), ("deg", angle)):
@@ -145,7 +147,9 @@ def compute_step_metrics(
             metrics[f"final_{label}{unit}"] = float(values[-1])
     metrics["late_s"] = metrics["arrival_s"] - step.direct_s
     metrics["late_mean_s"] = metrics["arrival_mean_s"] - step.direct_s
-    metrics["outside_share"] = 1 - float(np.mean(errors.find_within(tolerance)[after]))
+    after = since & (time >= limit - 1e-9)
+    outside = ~errors.find_within(tolerance)[after]
+    metrics["outside_share"] = float(outside.mean()) if outside.size else math.nan
     return metrics
 
 
@@ -174,7 +178,7 @@ def compute_metrics(
             compute_step_metrics(step, end, time, errors, tolerance)
             for step, end in zip(track.steps, ends, strict=True)
         ]
-        metrics |= {name: float(max(figures[name] for figures in each)) for name in each[0]}
+        metrics |= {name: float(np.max([figures[name] for figures in each])) for name in each[0]}
         metrics["goals"] = len(each)
         metrics["arrived_goals"] = sum(math.isfinite(figures["arrival_s"]) for figures in each)
         metrics["collided_goals"] = sum(

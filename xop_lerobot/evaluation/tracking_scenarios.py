@@ -44,7 +44,7 @@ ROOM_HALF = 4.0
 """Half the width of the scene `room`, between the walls' faces [m]."""
 WALL_DISTANCE = 0.25
 """Distance of the room's goals from the nearest wall [m]."""
-ROOM_HOLD_S = 1.0
+ROOM_HOLD_S = 1.5
 """How long each of the room's goals is held after it should have been reached [s]."""
 
 
