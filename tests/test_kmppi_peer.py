@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from xop_lerobot.evaluation.planner import SETTINGS, make_planner_table, measure_planners
 from xop_lerobot.retarget.config import MpcConfig
 from xop_lerobot.retarget.kmppi import Kmppi
+from xop_lerobot.retarget.sampling import DRAWS
 from xop_lerobot.retarget.weighting import compute_effective_samples
 
 torch = pytest.importorskip("torch")
@@ -74,15 +76,12 @@ def terminal_cost(states):
     return 5 * (weights * (states - 0.2) ** 2).sum(-1)
 
 
-class TorchNormals:
-    """The generator of torch with the interface of numpy's."""
-
-    def standard_normal(self, shape):
-        return torch.randn(*shape, dtype=torch.double).numpy()
-
-    @property
-    def bit_generator(self):  # the other samplings draw from here
-        return np.random.PCG64(0)
+@pytest.fixture(autouse=True)
+def torch_normals(monkeypatch):
+    """Gaussian noise comes from torch's generator, as with the other planner."""
+    monkeypatch.setitem(
+        DRAWS, "gaussian", lambda _, shape: torch.randn(*shape, dtype=torch.double).numpy()
+    )
 
 
 def record_theirs(case: Case) -> list[dict[str, np.ndarray]]:
@@ -143,11 +142,11 @@ def record_ours(case: Case, **changes) -> list[dict[str, np.ndarray]]:
     bound = np.full(ENTRIES, case.bound)
     planner = Kmppi(case.horizon, -bound, bound, config)
     planner.reset(np.zeros(ENTRIES))
-    state, rows = START, []
+    rng, state, rows = np.random.default_rng(0), START, []
     for i in range(COMMANDS):
         torch.manual_seed(100 + i)
         planner.shift(2.0)  # solved every second step; `shift="one"` takes no notice
-        samples = planner.sample(TorchNormals(), case.noise * NOISE_STD, NO_CANDIDATES)
+        samples = planner.sample(rng, case.noise * NOISE_STD, NO_CANDIDATES)
         costs, states = np.zeros(case.samples), np.tile(state, (case.samples, 1))
         for k in range(case.horizon):
             states = dynamics(states, samples.commands[:, k])
@@ -217,3 +216,15 @@ def test_every_other_setting_differs(change):
     theirs = record_theirs(case)
     assert find_difference(record_ours(case), theirs) < TOLERANCE
     assert find_difference(record_ours(case, **change), theirs) > 1e-3
+
+
+def test_the_comparison_of_times_has_a_row_per_case_and_setting():
+    times = measure_planners(((12, 3, 1), (12, 4, 2)), repeats=20)
+    assert [(row.setting, row.samples, row.horizon, row.knots) for row in times] == [
+        (setting, *case) for case in ((12, 3, 1), (12, 4, 2)) for setting in SETTINGS
+    ]
+    for row in times:
+        assert 0 < row.ours_us
+        assert 0 < row.theirs_without_rollouts_us < row.theirs_us
+        assert row.ratio == row.theirs_us / row.ours_us
+    assert len(make_planner_table(times).splitlines()) == 6

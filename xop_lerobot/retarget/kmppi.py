@@ -50,8 +50,9 @@ class Kmppi(SamplingOptimizer):
         self._interpolation = self._compute_interpolation(np.arange(horizon))
         self._shifts: dict[float, np.ndarray] = {}
         self._moved: np.ndarray | None = None
-        # One support value held over the horizon needs no interpolation.
+        # One value held over the horizon, or one at every step, needs no interpolation.
         self._constant = num_knots == 1 and config.kernel_mean == "hold"
+        self._direct = self._constant or num_knots == horizon
         self._low, self._high = self.low[:, None], self.high[:, None]
         self._draw = DRAWS[config.sampling]
 
@@ -157,7 +158,7 @@ class Kmppi(SamplingOptimizer):
     def _interpolate(self, knots: np.ndarray) -> np.ndarray:
         """Command sequences of support values, (S, k, K) -> (T, k, K), as one product."""
         num_knots, entries, total = knots.shape
-        if self._constant:
+        if self._direct:
             commands = np.empty((self.horizon, entries, total))
             commands[:] = knots
             return commands

@@ -40,19 +40,19 @@ def compute_weights(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
 def _weigh_finite(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
     excess = costs - costs[costs.argmin()]
     temperature = config.temperature
-    if config.weighting != "raw":
-        span = float(excess[excess.argmax()])
+    if config.weighting == "ess":
+        return _compute_ess_weights(excess, config.effective_samples)
+    if config.weighting == "minmax":
+        span = float(excess.max())
         if span < _LEAST_SPAN:
             return np.full(len(costs), 1 / len(costs))
-        if config.weighting == "ess":
-            return _compute_ess_weights(excess, span, config.effective_samples)
         temperature *= span
     weights = np.exp(excess * (-1 / temperature))
     weights *= 1 / weights.sum()
     return weights
 
 
-def _compute_ess_weights(excess: np.ndarray, span: float, wanted: float) -> np.ndarray:
+def _compute_ess_weights(excess: np.ndarray, wanted: float) -> np.ndarray:
     r"""Weights of the wanted effective sample size; those alike that tie, if more tie for best.
 
     Newton's method for :math:`f(s) = \log n(e^s) - \log n^*` with the sample size
@@ -68,16 +68,18 @@ def _compute_ess_weights(excess: np.ndarray, span: float, wanted: float) -> np.n
     if nth_best < _LEAST_SPAN:
         tied = excess < _LEAST_SPAN
         return tied / tied.sum()
-    position = math.log(0.5 * nth_best)  # the answer if costs are spread evenly
-    low, high = position - 60.0, math.log(1e3 * span)
+    position = math.log(0.65 * nth_best)  # the answer for most spreads of costs
+    low, high = position - 60.0, position + 60.0
     target = math.log(wanted)
-    basis = np.empty((2, count))
+    powers, basis = np.empty((2, count)), np.empty((2, count))  # e and e²; 1 and x
     basis[0], basis[1] = 1.0, excess
+    weights, squared = powers
     for _ in range(_MAX_ITERATIONS):
         temperature = math.exp(position)
-        weights = np.exp(excess * (-1 / temperature))
-        total, first = basis.dot(weights).tolist()
-        squares, second = basis.dot(weights * weights).tolist()
+        np.multiply(excess, -1 / temperature, out=weights)
+        np.exp(weights, out=weights)
+        np.multiply(weights, weights, out=squared)
+        (total, first), (squares, second) = powers.dot(basis.T).tolist()
         miss = 2 * math.log(total) - math.log(squares) - target
         if abs(miss) < _TOLERANCE or high - low < _TOLERANCE:
             break
@@ -89,8 +91,7 @@ def _compute_ess_weights(excess: np.ndarray, span: float, wanted: float) -> np.n
         position = position - miss / slope if slope > 0 else high
         if not low < position < high:
             position = 0.5 * (low + high)
-    weights *= 1 / total
-    return weights
+    return weights * (1 / total)
 
 
 def compute_effective_samples(weights: np.ndarray) -> float:
