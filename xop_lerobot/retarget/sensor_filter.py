@@ -10,7 +10,7 @@ _GROUPS = (slice(0, 3), slice(3, 5), slice(5, 6), slice(6, None))
 
 _LEARNING = 0.05  # share of the newest sample in a sensor's observed noise
 _NOISE_RANGE = (0.1, 10.0)  # observed noise over the configured one
-_TREND = 0.3  # share of the newest sample in the mean disagreement
+_TRENDS = np.array([[0.3], [0.1]])  # share of the newest sample in the mean disagreements
 
 
 class SensorFilter:
@@ -48,9 +48,15 @@ class SensorFilter:
         self._configured = np.square(position_std)
         self._gate = gate
         self._qpos, self._held = model.qpos0.copy(), np.full(3, np.nan)
+        # A robot without joints has no encoders.
+        starts = [group.start for group in _GROUPS if group.start < model.nv]
+        self._starts = np.array(starts)
+        self._sizes = np.diff([*starts, model.nv])
+        self._level = np.ones(len(starts))  # observed noise over the configured one, variances
         self._noise = self._configured.copy()
         self._variance = self._noise
-        self._innovation, self._trend = np.zeros((2, model.nv))
+        self._innovation = np.zeros(model.nv)
+        self._trend = np.zeros((len(_TRENDS), model.nv))
         self._is_new = True
 
     def reset(self) -> None:
@@ -109,6 +115,7 @@ class SensorFilter:
 
     def _start(self, qpos: np.ndarray) -> None:
         self._qpos, self._held = qpos.copy(), qpos[:3].copy()
+        self._level = np.ones(len(self._starts))
         self._noise = self._configured.copy()
         self._variance = self._noise.copy()
         self._innovation[:] = self._trend[:] = 0
@@ -116,25 +123,25 @@ class SensorFilter:
 
     def _observe_noise(self, error: np.ndarray, carried: np.ndarray, fresh: np.ndarray) -> None:
         """Follow the white noise of each sensor by what differs from one sample to the next."""
-        low, high = _NOISE_RANGE
+        low, high = np.square(_NOISE_RANGE)
         difference = 0.5 * (np.square(error - self._innovation) - carried) / self._configured
-        for group in _GROUPS:
-            if not fresh[group].all() or not difference[group].size:
-                continue
-            seen = self._configured[group] * np.clip(difference[group].mean(), 0.0, high**2)
-            noise = (1 - _LEARNING) * self._noise[group] + _LEARNING * seen
-            self._noise[group] = np.maximum(noise, low**2 * self._configured[group])
+        seen = np.add.reduceat(difference, self._starts) / self._sizes
+        useful = np.logical_and.reduceat(fresh, self._starts)
+        rate = np.where(useful, _LEARNING, 0.0)
+        self._level += rate * (np.clip(seen, 0.0, high) - self._level)
+        self._level = np.maximum(self._level, low)
+        self._noise = self._configured * np.repeat(self._level, self._sizes)
         self._innovation = np.where(fresh, error, self._innovation)
 
     def _find_lost(self, error: np.ndarray, variance: np.ndarray, fresh: np.ndarray) -> np.ndarray:
         """Entries that disagree once by too much, or by less for several ticks. Shape (nv,)."""
         ratio = error / np.sqrt(variance + self._noise)
-        self._trend = np.where(fresh, (1 - _TREND) * self._trend + _TREND * ratio, self._trend)
-        of_noise = np.sqrt(_TREND / (2 - _TREND))  # standard deviation of such a mean of noise
+        self._trend += np.where(fresh, _TRENDS * (ratio - self._trend), 0.0)
+        of_noise = np.sqrt(_TRENDS / (2 - _TRENDS))  # standard deviation of such a mean of noise
         lost = np.abs(ratio) > self._gate
-        lost |= np.abs(self._trend) > self._gate * of_noise
+        lost |= (np.abs(self._trend) > self._gate * of_noise).any(axis=0)
         lost &= fresh
         for group in _GROUPS[:3]:
             lost[group] = lost[group].any() & fresh[group]
-        self._trend[lost] = 0
+        self._trend[:, lost] = 0
         return lost

@@ -12,6 +12,8 @@ from xop_lerobot.command import Mode
 from xop_lerobot.retarget.sync_config import SyncConfig
 from xop_lerobot.retarget.sync_contacts import Contact, compute_height
 
+_RECENT = 0.2  # share of the newest tick in the recent mean of where a foot is seen
+
 
 class StanceMemory:
     r"""The active set C of Eq. 4 and the known stance locations :math:`p^{world}_{c,i}`.
@@ -51,6 +53,7 @@ class StanceMemory:
         self.active = ()
         self._stood = [0.0] * len(self.contacts)  # time in the mean [s]
         self._landed = [math.inf] * len(self.contacts)  # time since the touch-down [s]
+        self._departure = np.zeros((len(self.contacts), 3))  # recent mean, from the place
         self._spread = [(math.inf, math.inf)] * len(self.contacts)
         self._is_new = True
 
@@ -98,28 +101,50 @@ class StanceMemory:
         )
         return abs(height) < self.config.lost_height and tilt < self.config.lost_tilt
 
-    def remember(self, places: np.ndarray, dt: float, noise: tuple[float, float]) -> None:
+    def remember(
+        self,
+        places: np.ndarray,
+        dt: float,
+        noise: tuple[float, float],
+        std: tuple[float, float],
+    ) -> None:
         """Take the feet of the filtered measurement into the mean of their places.
 
         Args:
             places: x, y [m] and heading [rad] of every contact. Shape (contacts, 3).
             dt: Time since the last one [s].
             noise: Standard deviations of a measured position [m] and heading [rad] of the base.
+            std: Those of the filtered position and heading.
         """
         for index in self.active:
             stood = self._stood[index]
             if stood == 0:
-                self.places[index] = places[index]
+                self.places[index], self._departure[index] = places[index], 0
             self._stood[index] = stood = min(stood + dt, self.config.memory_s)
             share = dt / stood if stood else 1.0
             change = places[index] - self.places[index]
             change[2] = math.remainder(change[2], 2 * math.pi)
+            self._departure[index] += _RECENT * (change - self._departure[index])
+            if stood > dt and self._has_left(index, std):
+                self._stood[index] = stood = dt
+                self._departure[index] = 0
+                share = 1.0
             self.places[index] += share * change
             best = (self.config.stance_position, self.config.stance_heading)
             self._spread[index] = tuple(
                 math.hypot(least, one * math.sqrt(share))
                 for least, one in zip(best, noise, strict=True)
             )
+
+    def _has_left(self, index: int, std: tuple[float, float]) -> bool:
+        """Whether a foot has been seen beside its place for several ticks: it crept away."""
+        place, heading = self._spread[index]
+        moved, turned = self._departure[index, :2], abs(self._departure[index, 2])
+        gate = self.config.gate
+        return bool(
+            np.abs(moved).max() > gate * math.hypot(place, std[0])
+            or turned > gate * math.hypot(heading, std[1])
+        )
 
     def compute_std(self) -> list[np.ndarray]:
         """Standard deviations of the residuals of each active contact; see `SyncTask`."""

@@ -183,10 +183,14 @@ class StateSync:
             self.stance.reset()
             self.stance.update_contacts(configuration.data, mode, 0.0)
             velocity, _ = self._project(qvel)
+        std = self._filter.std
         self.stance.remember(
-            self.task.compute_places(configuration.data), dt, self._filter.base_noise
+            self.task.compute_places(configuration.data),
+            dt,
+            self._filter.base_noise,
+            (std[0], std[5]),
         )
-        self.task.set_measurement(measured, self._filter.std)
+        self.task.set_measurement(measured, std)
         active = self.stance.active
         self.task.set_active(active, self.stance.compute_std(), self.stance.places)
         iterations, bounded = self._descend()

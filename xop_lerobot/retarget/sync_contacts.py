@@ -142,7 +142,7 @@ def compute_equilibrium(
     has_base = model.njnt > 0 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
     if not has_base or weight == 0:
         return qpos.copy()
-    step = np.zeros(3)
+    step = np.array([-_find_gap(model, qpos) - 1e-4, 0.0, 0.0])
     for _ in range(iterations):
         excess, q = compute_excess(step)
         if np.abs(excess).max() < 1e-6 * weight:
@@ -159,6 +159,18 @@ def compute_equilibrium(
             break
         step = step + change * min(1.0, 5e-4 / max(np.abs(change).max(), 1e-12))
     return qpos.copy()
+
+
+def _find_gap(model: mujoco.MjModel, qpos: np.ndarray) -> float:
+    """How far a robot must be lowered to touch the ground, at most 2 cm, to 0.1 mm [m]."""
+    data = mujoco.MjData(model)
+    for gap in np.arange(0, 0.02, 1e-4):
+        data.qpos[:] = qpos
+        data.qpos[2] -= gap
+        mujoco.mj_fwdPosition(model, data)
+        if data.ncon:
+            return float(gap)
+    return 0.0
 
 
 def _compute_depth(model: mujoco.MjModel, data: mujoco.MjData) -> float:

@@ -11,7 +11,6 @@ import numpy as np
 
 from xop_lerobot.retarget.sync_config import SyncConfig
 from xop_lerobot.retarget.sync_contacts import Contact, compute_height
-from xop_lerobot.transforms import quat_conjugate, quat_log, quat_multiply
 
 
 class SyncTask(mink.Task):
@@ -142,11 +141,12 @@ class SyncTask(mink.Task):
         qpos, measured = data.qpos, self._measured
         mujoco.mj_differentiatePos(self.model, self._difference, 1.0, measured, qpos)
         error[: self._num_own] = self._difference
-        # log(R R~^T) in the world's axes, where tilt and heading are apart.
-        turn = quat_log(quat_multiply(qpos[3:7], quat_conjugate(measured[3:7])))
-        error[3:6] = turn
+        # log(R R~^T) in the world's axes, where tilt and heading are apart, is log(R~^T R) turned.
         mujoco.mju_quat2Mat(self._rotation, qpos[3:7])
-        jacobian[3:6, 3:6] = _inverse_left_jacobian(turn) @ self._rotation.reshape(3, 3)
+        rotation = self._rotation.reshape(3, 3)
+        turn = rotation @ self._difference[3:6]
+        error[3:6] = turn
+        jacobian[3:6, 3:6] = _inverse_left_jacobian(turn) @ rotation if turn.any() else rotation
         row = self._num_own
         for index in self._active:
             evaluate = self._evaluate_wheel if self.wheeled else self._evaluate_foot
