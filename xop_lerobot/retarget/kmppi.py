@@ -79,7 +79,9 @@ class Kmppi(SamplingOptimizer):
     @property
     def nominal(self) -> np.ndarray:
         """The planned sequence before the bounds. Shape (T, k)."""
-        return self._interpolation @ self.knots if self._moved is None else self._moved.copy()
+        if self._moved is not None:
+            return self._moved.copy()
+        return self._interpolation.dot(self.knots)  # faster than @ where arrays are small
 
     @property
     def commands(self) -> np.ndarray:
@@ -101,7 +103,7 @@ class Kmppi(SamplingOptimizer):
             moved = np.zeros((self.horizon, len(self.low)))
             moved[: self.horizon - whole] = self.nominal[whole:]
             self._moved = moved
-        self.knots = self._get_shift(steps) @ self.knots
+        self.knots = self._get_shift(steps).dot(self.knots)
 
     def _get_shift(self, steps: float) -> np.ndarray:
         """Matrix that moves the support values on by `steps`. Shape (S, S)."""
@@ -185,7 +187,7 @@ class Kmppi(SamplingOptimizer):
         weights = self._weigh(costs if samples.penalty is None else costs + samples.penalty)
         rows = samples.knots.transpose(1, 2, 0).reshape(-1, len(weights))
         mean = rows.dot(weights)
-        if not math.isfinite(mean.sum()):  # a sample that is not finite got in with weight 0
+        if not math.isfinite(mean.dot(mean)):  # a sample that is not finite got in with weight 0
             used = weights > 0
             mean = rows[:, used].dot(weights[used])
         self.knots, self._moved = mean.reshape(self.knots.shape), None

@@ -27,7 +27,7 @@ def compute_weights(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
     Returns:
         Weights. Shape (K,). All on the first sample (the standing plan) if no cost is finite.
     """
-    if math.isfinite(float(costs.sum())):  # so they all are, in one look
+    if math.isfinite(costs.dot(costs)):  # so they all are, in one look
         return _weigh_finite(costs, config)
     weights, finite = np.zeros(len(costs)), np.isfinite(costs)
     if finite.any():
