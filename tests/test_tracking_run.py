@@ -162,6 +162,8 @@ def test_a_run_knows_its_physics_steps(short):
     assert record["physics_steps_per_s"] == 4 * 2 * 25 * 4
     assert record["metrics"]["after_mean_max_cm"] is None  # half a second has no 1 s mean
     assert record["setup"] == dataclasses.asdict(short)
+    assert record["trace"]["limits"] == [0.3]
+    assert len(record["trace"]["position_cm"]) == 3
 
 
 # -- file, tables, document ----------------------------------------------------------------------
@@ -178,6 +180,7 @@ def make_run(name="squat", ablation="default", robot="g1", seed=0, hold=10.0, **
         "robot": robot, "scenario": name, "ablation": ablation, "noise": "mild", "seed": seed,
         "setup": dataclasses.asdict(setup), "hold": hold, "physics_steps_per_s": 12800.0,
         "contacts": [], "wall_s": 1.0, "metrics": figures,
+        "trace": {"dt": 0.2, "position_cm": [2.0 + seed] * 50, "limits": [2.5]},
     }  # fmt: skip
     return setup.compute_key(seed), record
 
@@ -272,7 +275,8 @@ def all_runs() -> dict:
     )
 
 
-def test_every_table_of_the_document_can_be_filled_and_parses(tmp_path):
+def test_every_table_and_picture_of_the_document_can_be_filled_and_parses(tmp_path):
+    pytest.importorskip("matplotlib")
     runs = all_runs()
     results = tmp_path / "results.json"
     results.write_text(json.dumps({"machine": {"processor": "P", "cores": "2"}, "runs": runs}))
@@ -292,6 +296,10 @@ def test_every_table_of_the_document_can_be_filled_and_parses(tmp_path):
     filled = document.read_text()
     blocks = re.findall(r"<!-- begin (.*?) -->\n(.*?)\n<!-- end \1 -->", filled, re.DOTALL)
     tables = {name: block for name, block in blocks if name.startswith(ROBOTS)}
+    for robot in ROBOTS:
+        picture = tables.pop(f"{robot} plot")
+        assert picture == f"![Position error over time, {robot}](images/tracking_{robot}.png)"
+        assert (document.parent / "images" / f"tracking_{robot}.png").stat().st_size > 10_000
     assert len(tables) >= 14
     for name, block in tables.items():
         assert len(parse_table(block)) >= 1, name
@@ -324,6 +332,7 @@ def test_scenario_tables_take_the_longest_hold_and_variants_their_own():
 
 
 def test_runs_with_other_settings_are_left_out(tmp_path):
+    pytest.importorskip("matplotlib")
     key, run = make_run()
     stale = "g1/squat/default/1/00000000"
     setup = TrackingSetup("g1", "squat", overrides={"horizon": 3})

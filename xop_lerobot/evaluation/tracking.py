@@ -16,7 +16,11 @@ from typing import Any
 import numpy as np
 
 from xop_lerobot.errors import UnknownName
-from xop_lerobot.evaluation.tracking_metrics import Trajectory, compute_metrics
+from xop_lerobot.evaluation.tracking_metrics import (
+    Trajectory,
+    compute_errors,
+    compute_metrics,
+)
 from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, GoalTrack, Scenario
 from xop_lerobot.evaluation.tracking_setup import (
     TrackingSetup,
@@ -47,6 +51,8 @@ from xop_lerobot.transforms import (
     quat_from_yaw,
 )
 
+TRACE_DT = 0.2
+"""Time between the points of a run's trace [s]."""
 OPEN_PINCH = 0.1  # distance of thumb and index of an open hand [m]
 
 
@@ -297,7 +303,21 @@ def make_record(
         "sim_s": float(trajectory.time[-1]),
         "wall_s": round(wall_s, 1),
         "contacts": [" - ".join(pair) for pair in trajectory.contacts],
+        "trace": make_trace(track, trajectory),
         "metrics": {
             name: value if math.isfinite(value) else None for name, value in metrics.items()
         },
+    }
+
+
+def make_trace(track: GoalTrack, trajectory: Trajectory) -> dict[str, Any]:
+    """The instant position error over time, five times a second, for plots."""
+    errors = compute_errors(trajectory, [step.start for step in track.steps])
+    times = np.arange(0, trajectory.time[-1] + 1e-9, TRACE_DT)
+    position = np.interp(times, trajectory.time, errors.position) * 100
+    limits = [step.start + step.limit_s for step in track.steps]
+    return {
+        "dt": TRACE_DT,
+        "position_cm": [round(float(value), 2) for value in position],
+        "limits": [round(limit, 2) for limit in limits],
     }

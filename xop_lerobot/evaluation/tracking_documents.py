@@ -9,6 +9,7 @@ from typing import Any
 
 from xop_lerobot.errors import BadValue, XopError
 from xop_lerobot.evaluation.bench_report import describe_versions, make_bench_blocks
+from xop_lerobot.evaluation.tracking_plot import plot_variants
 from xop_lerobot.evaluation.tracking_report import (
     Run,
     fill_document,
@@ -25,6 +26,7 @@ from xop_lerobot.evaluation.tracking_setup import (
 
 DOCUMENT = Path("docs/benchmarks.md")
 ROBOTS = ("g1", "rby1")
+PLOTTED = ("stationary", "mobile", "curve")
 VARIANTS = {
     "ablations": {
         name: ablation
@@ -73,11 +75,36 @@ def write_documents(root: Path, results: Path, benches: Sequence[Path] = ()) -> 
     blocks = make_blocks(runs, machine) if runs else {}
     if benches:
         blocks |= make_bench_blocks([json.loads(path.read_text()) for path in benches])
+    blocks |= draw_plots(document.parent, runs)
     document.write_text(fill_document(document.read_text(), blocks))
     lines = [f"written: {document} ({', '.join(blocks)})"]
     if len(runs) < len(everything):
         lines.append(f"left out: {len(everything) - len(runs)} runs with other settings")
     return lines
+
+
+def draw_plots(folder: Path, runs: Mapping[str, Run]) -> dict[str, str]:
+    """Draw the errors of each robot's runs over time, where variants were held as long.
+
+    Args:
+        folder: Folder of the document; pictures go to ``images``.
+        runs: Runs by key.
+
+    Returns:
+        Blocks with the pictures.
+    """
+    blocks = {}
+    names = [name for kind in PLOTTED for name in SCENARIO_GROUPS[kind]]
+    for robot in ROBOTS:
+        own = {key: run for key, run in runs.items() if run["robot"] == robot}
+        variants = [run for run in own.values() if run["ablation"] != "default"]
+        holds = [run["hold"] for run in variants or own.values()]
+        if not holds:
+            continue
+        picture = f"images/tracking_{robot}.png"
+        if plot_variants(folder / picture, _keep_holds(own, {max(holds)}), robot, names):
+            blocks[f"{robot} plot"] = f"![Position error over time, {robot}]({picture})"
+    return blocks
 
 
 def is_current(key: str, run: Run) -> bool:

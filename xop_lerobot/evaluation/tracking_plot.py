@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from xop_lerobot.evaluation.tracking_metrics import Trajectory, compute_errors
-from xop_lerobot.evaluation.tracking_scenarios import GoalTrack
+from xop_lerobot.evaluation.tracking_report import Run, select
+from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, GoalTrack
 from xop_lerobot.transforms import quat_to_rpy
 
 if TYPE_CHECKING:
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
+CHOSEN = {"default": "#1f77b4", "no_sync": "#2ca02c", "table1_equal": "#d95f02"}
+"""Variants that `plot_variants` draws, and their colours."""
 GOAL, HEAD, BASE = "#888888", "#1f77b4", "#d95f02"
 
 
@@ -116,3 +120,63 @@ def plot_floor(ax: Axes, trajectory: Trajectory) -> None:
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("x [m]")
     ax.set_ylabel("y [m]")
+
+
+def plot_variants(path: Path, runs: Mapping[str, Run], robot: str, scenarios: Sequence[str]) -> int:
+    """Draw the position error over time of some variants: median, best and worst over the seeds.
+
+    Args:
+        path: Picture to write.
+        runs: Runs by key, of one hold.
+        robot: The robot.
+        scenarios: A chart each.
+
+    Returns:
+        How many curves were drawn; with none, nothing is written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    columns = 3
+    rows = -(-len(scenarios) // columns)
+    figure = Figure(figsize=(4 * columns, 2.6 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    drawn = 0
+    for ax, scenario in zip(axes, scenarios, strict=False):
+        for ablation, color in CHOSEN.items():
+            found = select(runs, robot=robot, scenario=scenario, ablation=ablation)
+            traces = [run["trace"] for run in found if run.get("trace")]
+            if traces:
+                _plot_band(ax, traces, color, ablation)
+                drawn += 1
+        ax.set_title(f"{scenario}: {SCENARIOS[scenario].title}", fontsize=9)
+        ax.set_yscale("log")
+        ax.set_ylim(0.1, 300)
+        ax.grid(alpha=0.3)
+        tolerance = SCENARIOS[scenario].get_tolerance(robot).position * 100
+        ax.axhline(tolerance, color="k", lw=0.7, ls=":")
+    for ax in axes[len(scenarios) :]:
+        ax.set_axis_off()
+    axes[0].set_ylabel("position error [cm]")
+    axes[0].legend(loc="best", fontsize=7)
+    figure.supxlabel("time [s]", fontsize=9)
+    if drawn:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=80)
+    return drawn
+
+
+def _plot_band(ax: Axes, traces: Sequence[Mapping[str, Any]], color: str, label: str) -> None:
+    """Median of traces as a line, and their range; those that end early count until then."""
+    longest = max(len(trace["position_cm"]) for trace in traces)
+    values = np.full((len(traces), longest), np.nan)
+    for row, trace in zip(values, traces, strict=True):
+        row[: len(trace["position_cm"])] = trace["position_cm"]
+    times = np.arange(longest) * traces[0]["dt"]
+    ax.plot(times, np.nanmedian(values, axis=0), color=color, lw=1.2, label=label)
+    ax.fill_between(
+        times, np.nanmin(values, axis=0), np.nanmax(values, axis=0), color=color, alpha=0.2, lw=0
+    )
+    for limit in traces[0]["limits"]:
+        ax.axvline(limit, color="k", lw=0.7, ls="--")

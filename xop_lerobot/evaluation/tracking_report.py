@@ -39,8 +39,12 @@ class Results:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")
-        content = {"machine": describe_machine(), "runs": self.runs}
-        part.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        machine = json.dumps(describe_machine())
+        lines = ",\n".join(
+            f"{json.dumps(name)}: {json.dumps(each, allow_nan=False)}"
+            for name, each in self.runs.items()
+        )
+        part.write_text(f'{{"machine": {machine}, "runs": {{\n{lines}\n}}}}\n')
         part.replace(self.path)
 
 
