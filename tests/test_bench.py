@@ -102,7 +102,7 @@ def test_the_bare_rollout_is_that_of_the_planner_in_one_call():
             bare_pool.rollout(model, data, start, controls, state=state)
             out["state"], out["controls"] = state, controls
 
-    bare_pool, bare._pool = bare._pool, Spy()
+    bare_pool, vars(bare)["_pool"] = bare._pool, Spy()
     assert bare.run(state, 3, 4) > 0
     nq = rollout.model.nq
     assert out["controls"].shape == (3, 4 * rollout.substeps, rollout.model.nu)

@@ -267,7 +267,7 @@ def test_of_several_goals_the_worst_counts():
 def test_a_moving_goal_is_told_by_its_mean_error():
     time = np.arange(0, 21, DT)
     path = make_curve(HOME)
-    goal = np.array([path(t) for t in time])
+    goal = np.array([path(float(t)) for t in time])
     head = goal.copy()
     head[:, 2] += 0.07
     track = GoalTrack(HOME, 21.0, path=path)
