@@ -23,7 +23,7 @@ class StanceMemory:
     does not count.
 
     The place of a foot is the mean of where the filtered measurement has seen it since it came
-    to stand, forgetting with `memory_s`:
+    to stand, forgetting with the memory's time:
 
     .. math::
 
@@ -107,6 +107,7 @@ class StanceMemory:
         dt: float,
         noise: tuple[float, float],
         std: tuple[float, float],
+        memory_s: float,
     ) -> None:
         """Take the feet of the filtered measurement into the mean of their places.
 
@@ -115,12 +116,13 @@ class StanceMemory:
             dt: Time since the last one [s].
             noise: Standard deviations of a measured position [m] and heading [rad] of the base.
             std: Those of the filtered position and heading.
+            memory_s: Longest time over which to average [s].
         """
         for index in self.active:
             stood = self._stood[index]
             if stood == 0:
                 self.places[index], self._departure[index] = places[index], 0
-            self._stood[index] = stood = min(stood + dt, self.config.memory_s)
+            self._stood[index] = stood = min(stood + dt, memory_s)
             share = dt / stood if stood else 1.0
             change = places[index] - self.places[index]
             change[2] = math.remainder(change[2], 2 * math.pi)

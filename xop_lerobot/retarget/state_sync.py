@@ -172,11 +172,11 @@ class StateSync:
             qvel = qvel.copy()
             qvel[:3] = self._bias.update(qpos[:3], qvel[:3], dt)
         velocity, variance = self._project(qvel)
-        mean, change = velocity, np.zeros_like(velocity)
+        mean, carried = velocity, variance
         if not self._is_new:
             mean = 0.5 * (velocity + self._last.qvel)
-            change = velocity - self._last.qvel
-        carried = variance + np.square(self._curvature * change)
+            change = np.square(velocity - self._last.qvel) - 2 * variance  # beyond mere noise
+            carried = variance + np.square(self._curvature) * np.maximum(change, 0)
         measured, restarted = self._filter.update(qpos, mean, carried, dt)
         configuration.update(measured)
         if restarted:  # the guess was wrong, and with it all that came of it
@@ -189,6 +189,8 @@ class StateSync:
             dt,
             self._filter.base_noise,
             (std[0], std[5]),
+            # The noisier velocities are, the less they tell of feet that creep.
+            self.config.memory_s / math.sqrt(self._noise),
         )
         self.task.set_measurement(measured, std)
         active = self.stance.active
@@ -226,9 +228,12 @@ class StateSync:
             disagreement = compute_disagreement(qvel, variance, jacobian, allowed)
             if landing < _LANDED:
                 disagreements.append(disagreement)
-            if disagreement > self.config.gate:  # it slips or swings
+            excess = disagreement / self.config.gate - 1
+            if excess > 1:  # it slips or swings
                 stance.release(index)
-                continue
+            if excess > 0:  # the less it fits, the less it counts
+                own = np.square(jacobian) @ variance
+                allowed = allowed + excess * (own + allowed)
             jacobians.append(jacobian)
             variances.append(allowed)
         if disagreements and self.config.recursive:

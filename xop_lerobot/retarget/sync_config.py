@@ -51,7 +51,8 @@ class SyncConfig:
         lift_height: Height over the lowest foot at which a foot is off the ground [m].
         lost_height: Height over or under the ground, as measured, at which no contact counts [m].
         lost_tilt: Tilt of a foot, or of an axle, at which its contact does not count [rad].
-        memory_s: Time over which the place of a standing foot is averaged [s].
+        memory_s: Time over which the place of a standing foot is averaged, while the velocities
+            are as good as configured [s].
         bias_s: Time in which a bias of the measured velocity is found [s].
         gate: Disagreement of measurement and memory at which the memory is begun anew, in
             standard deviations [1].
@@ -87,7 +88,7 @@ class SyncConfig:
     lift_height: float = 0.025
     lost_height: float = 0.1
     lost_tilt: float = 0.35
-    memory_s: float = 2.0
+    memory_s: float = 1.5
     bias_s: float = 3.0
     gate: float = 4.0
     max_gap_s: float = 0.2
