@@ -48,8 +48,12 @@ class G1(Morphology):
             CommandDim("waist_yaw", "waist_yaw.pos", "rad", -1.0, 1.0, 0.0, 2.0),
             CommandDim("waist_roll", "waist_roll.pos", "rad", -0.5, 0.5, 0.0, 2.0),
             CommandDim("waist_pitch", "waist_pitch.pos", "rad", -0.5, 0.5, 0.0, 2.0),
-            CommandDim("vx", "x.vel", "m/s", -1.0, 1.0, 0.0, 3.0, mobile_only=True),
-            CommandDim("vy", "y.vel", "m/s", -0.6, 0.6, 0.0, 3.0, mobile_only=True),
+            CommandDim(
+                "vx", "x.vel", "m/s", -1.0, 1.0, 0.0, 3.0, mobile_only=True, sway=0.3, sway_rate=0.2
+            ),
+            CommandDim(
+                "vy", "y.vel", "m/s", -0.6, 0.6, 0.0, 3.0, mobile_only=True, sway=0.2, sway_rate=0.2
+            ),
             CommandDim("yaw_rate", "theta.vel", "rad/s", -1.0, 1.0, 0.0, 5.0, mobile_only=True),
         )
     )

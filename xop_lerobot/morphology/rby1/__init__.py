@@ -48,7 +48,9 @@ def _make_torso_dims() -> tuple[CommandDim, ...]:
     for i, ready in enumerate(TORSO_READY):
         low, high = joints[f"torso_{i}"].limits or (-math.pi, math.pi)
         name = f"torso_{i}"
-        dims.append(CommandDim(name, f"{name}.pos", "rad", low, high, ready, TORSO_RATES[i]))
+        rate = TORSO_RATES[i]
+        key = f"{name}.pos"
+        dims.append(CommandDim(name, key, "rad", low, high, ready, rate, max_accel=10 * rate))
     return tuple(dims)
 
 
@@ -59,8 +61,9 @@ class RBY1(Morphology):
     name = "rby1"
     command_space = CommandSpace(
         (
-            CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.5, mobile_only=True),
-            CommandDim("yaw_rate", "theta.vel", "rad/s", -1.5, 1.5, 0.0, 3.0, mobile_only=True),
+            # name, key, unit, low, high, neutral, largest rate and change of rate
+            CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.5, True, 30.0),
+            CommandDim("yaw_rate", "theta.vel", "rad/s", -1.5, 1.5, 0.0, 3.0, True, 60.0),
             *_make_torso_dims(),
         )
     )
