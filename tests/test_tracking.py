@@ -350,7 +350,9 @@ def test_each_ablation_runs_its_own_settings_and_nothing_else_differs(robot, nam
             assert fields <= set(ablation.mpc)
             assert bool(fields) == bool(ablation.mpc)
         else:
-            assert {"weighting", "kernel_mean", "weights"} <= fields
+            assert {"weighting", "importance_cost", "weights", "candidates"} <= fields
+            for entry, value in ablation.mpc.items():
+                assert getattr(own[mode], entry) == value
         make = make_tuned_morphology(setup)
         assert make.mpc_config(mode) == own[mode]
     assert setup.compute_key(0) != stock.compute_key(0)

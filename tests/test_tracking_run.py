@@ -246,6 +246,7 @@ def test_the_ablation_table_has_a_row_per_variant_that_ran():
     rows = parse_table(make_ablation_table(runs, "g1", ["squat"], ABLATIONS))
     assert [row["variant"].split(":")[0] for row in rows] == ["`default`", "`table1`"]
     assert [row["final [cm]"] for row in rows] == ["1 / 1", "10 / 10"]
+    assert [row["× default"] for row in rows] == ["1.0", "10.0"]
     assert rows[0]["physics steps/s"] == "12800"
 
 

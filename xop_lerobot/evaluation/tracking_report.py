@@ -148,6 +148,15 @@ def format_cell(runs: Sequence[Run], metric: str) -> str:
     return f"{format_number(median)} / {format_number(worst)}"
 
 
+def format_ratio(runs: Sequence[Run], base: Sequence[Run], metric: str) -> str:
+    """Median of a figure over that of the runs `base`."""
+    median, _ = compute_median_and_worst(runs, metric)
+    reference, _ = compute_median_and_worst(base, metric)
+    if not (math.isfinite(median) and math.isfinite(reference) and reference > 0):
+        return "–"
+    return f"{median / reference:.1f}"
+
+
 def select(runs: Mapping[str, Run], **wanted: Any) -> list[Run]:
     """Runs whose entries are as wanted, in order of their seeds."""
     found = [run for run in runs.values() if all(run[k] == v for k, v in wanted.items())]
@@ -181,7 +190,8 @@ def make_ablation_table(
 ) -> str:
     """Table of variants, a row each, over all runs of `scenarios`; cells as in the others.
 
-    A figure that a scenario does not have leaves that scenario out of its column.
+    A figure that a scenario does not have leaves that scenario out of its column. The ratio is
+    that of the first figure's medians.
     """
     groups = {
         name: [
@@ -209,12 +219,13 @@ def make_ablation_table(
             [
                 f"`{name}`: {ablations[name].title}",
                 *cells,
+                format_ratio(found, groups.get("default", []), next(iter(columns.values()), "")),
                 format_cell(found, "falls"),
                 " and ".join(str(step) for step in steps),
                 str(len(found)),
             ]
         )
-    return make_table(["variant", *columns, "falls", "physics steps/s", "runs"], rows)
+    return make_table(["variant", *columns, "× default", "falls", "physics steps/s", "runs"], rows)
 
 
 # -- documents -----------------------------------------------------------------------------------

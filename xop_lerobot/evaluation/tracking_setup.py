@@ -54,6 +54,12 @@ ABLATIONS: dict[str, Ablation] = {
     "default": Ablation("the default preset"),
     "table1": Ablation("our Table I, its own numbers", preset="table1"),
     "table1_equal": Ablation("our Table I, equal compute", preset="table1", equal_compute=True),
+    "table1_hold": Ablation(
+        "the same, with a kernel that holds",
+        {"kernel_mean": "hold"},
+        preset="table1",
+        equal_compute=True,
+    ),
     "no_extrapolation": Ablation("no extrapolated terminal state", {"extrapolation_s": 0.0}),
     "no_hold_kernel": Ablation("kernel of zero mean", {"kernel_mean": "zero"}),
     "no_time_shift": Ablation("one control step of shift", {"shift": "one"}),
