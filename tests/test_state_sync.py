@@ -422,6 +422,17 @@ def test_a_second_look_at_the_same_instant_and_a_clock_that_starts_over(robot):
         np.testing.assert_allclose(synced.qpos[:3], qpos[:3], atol=1e-3)
 
 
+def test_the_same_measurement_again_is_no_news(robot):
+    morphology, model = robot
+    rng, once, twice = np.random.default_rng(0), make_sync(robot), make_sync(robot)
+    for tick in range(10):
+        qpos = perturb(model, morphology.standing_qpos(), rng)
+        arguments = (tick * DT, qpos, np.zeros(model.nv), Mode.STATIONARY)
+        first = once.synchronise(*arguments)
+        assert twice.synchronise(*arguments) is twice.synchronise(*arguments)
+    np.testing.assert_array_equal(first.qpos, twice.synchronise(*arguments).qpos)
+
+
 def test_reset_forgets(robot):
     morphology, model = robot
     far = morphology.standing_qpos()

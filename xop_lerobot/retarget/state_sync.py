@@ -45,7 +45,7 @@ class Synced:
     Attributes:
         qpos: Generalised position, MuJoCo order; read-only. Shape (nq,).
         qvel: Generalised velocity, MuJoCo order; read-only. Shape (nv,).
-        residual: Root mean square, over the rows of all active contacts, of the position residual
+        residual: Root mean square, over the active contacts, of the height over their equilibrium
             that is left [m]; 0 without one.
         status: How the solve ended.
         iterations: Steps of the SQP.
@@ -116,6 +116,7 @@ class StateSync:
         """Forget the past: the robot may be anywhere now."""
         self.failures = self.num_qps = 0
         self._last: Synced | None = None
+        self._seen = (np.zeros(0), np.zeros(0))
         self._last_time = -np.inf
         self._forget()
 
@@ -137,17 +138,28 @@ class StateSync:
 
         Returns:
             The state; the measurement with status `MEASUREMENT` where there is no solution, and
-            the last good state where the measurement is not finite.
+            the last good state where the measurement is not finite. The same measurement of the
+            same time once more gives the same state.
         """
         try:
             if not (np.isfinite(qpos).all() and np.isfinite(qvel).all() and np.isfinite(time)):
                 return self._fall_back(qpos, qvel)
-            self._last = self._solve(float(time), np.asarray(qpos), np.asarray(qvel), mode)
-        except (mink.MinkError, np.linalg.LinAlgError, ValueError, TypeError):
-            logger.debug("state synchronisation failed", exc_info=True)
+            qpos, qvel = np.asarray(qpos), np.asarray(qvel)
+            if self._last is not None and self._is_seen(time, qpos, qvel):
+                return self._last
+            self._last = self._solve(float(time), qpos, qvel, mode)
+            self._seen = (qpos.copy(), qvel.copy())
+        except Exception as error:  # noqa: BLE001 whatever it is, the control loop goes on
+            if not self.failures:
+                logger.warning("state synchronisation failed: %r; the measurement is used", error)
             self._forget()
             return self._fall_back(qpos, qvel)
         return self._last
+
+    def _is_seen(self, time: float, qpos: np.ndarray, qvel: np.ndarray) -> bool:
+        """Whether this is the last measurement again: a look at a robot that did not move on."""
+        same = zip((qpos, qvel), self._seen, strict=True)
+        return time == self._last_time and all(np.array_equal(*pair) for pair in same)
 
     def _fall_back(self, qpos: np.ndarray, qvel: np.ndarray) -> Synced:
         self.failures += 1

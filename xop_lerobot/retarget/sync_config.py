@@ -91,7 +91,7 @@ class SyncConfig:
     memory_s: float = 1.5
     bias_s: float = 3.0
     gate: float = 4.0
-    max_gap_s: float = 0.2
+    max_gap_s: float = 0.3
     iterations: int = 4
     tolerance: float = 2e-4
     recursive: bool = True
