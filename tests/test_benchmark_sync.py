@@ -1,0 +1,45 @@
+"""The benchmark of the state synchronisation: it runs its cases, and memory predicts best."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "benchmark_sync.py"
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    spec = importlib.util.spec_from_file_location("xop_benchmark_sync", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("case", ["g1 stands", "rby1 drives"])
+def test_synchronised_states_predict_better_than_raw_ones(benchmark, case, capsys):
+    errors = {name: benchmark.Errors() for name in ("raw", *benchmark.VARIANTS)}
+    benchmark.run(benchmark.CASES[case], "mild", 0, 6.0, errors)
+    benchmark.print_table(case, errors)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == f"{case}: 10 predictions, 100 states; RMS"
+    assert [line[:28].strip() for line in lines[4:]] == list(errors)
+    raw, best = errors["raw"], errors["NLS + velocity + memory"]
+    for horizon in benchmark.HORIZONS:
+        short = [np.mean(np.square(e.predicted[horizon])) for e in (best, raw)]
+        assert short[0] < 0.25 * short[1]
+    assert np.mean(best.position) < 0.4 * np.mean(raw.position)
+
+
+def test_without_noise_a_prediction_from_the_raw_state_is_the_true_one(benchmark):
+    errors = {name: benchmark.Errors() for name in ("raw", *benchmark.VARIANTS)}
+    benchmark.run(benchmark.CASES["rby1 stands"], "off", 0, 2.5, errors)
+    assert max(errors["raw"].predicted[10]) == 0
+    assert max(errors["NLS + velocity + memory"].predicted[10]) < 1e-3
