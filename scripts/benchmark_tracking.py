@@ -68,8 +68,11 @@ def parse_args(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--preset", default="default", help="preset of the retargeter (default: default)")
     add("--no-sync", action="store_true", help="do not synchronise the state")
     add("--low-level", default="", help="low-level policy (default: the robot's own)")
+    add("--low-level-path", default="", help="its file (default: its own)")
     add("--hold", type=float, default=10.0, help="how long goals are held [s] (default: 10)")
     add("--goals", type=int, default=10, help="goals per run of `room` (default: 10)")
+    add("--payload", type=float, default=0.0,
+        help="mass in each hand that the planner does not know [kg] (default: 0)")  # fmt: skip
     add("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings",
         help="override a setting of MpcConfig: horizon=20, mobile.weights.control=0.01, "
         "noise_std.vx=0.2; may be repeated")  # fmt: skip
@@ -112,8 +115,10 @@ def make_setups(args: argparse.Namespace) -> list[TrackingSetup]:
             preset=args.preset,
             sync=not args.no_sync,
             low_level=args.low_level,
+            low_level_path=args.low_level_path,
             hold=args.hold,
             goals=args.goals,
+            payload=args.payload,
             overrides=parse_overrides(args.settings),
         )
         for ablation in ablations

@@ -18,6 +18,7 @@ from xop_lerobot.evaluation.tracking import (
     GoalDevice,
     WorldAlignment,
     get_scenario,
+    make_loaded_model,
     run_scenario,
     run_trial,
 )
@@ -43,6 +44,7 @@ from xop_lerobot.evaluation.tracking_scenarios import (
     move_from,
 )
 from xop_lerobot.evaluation.tracking_setup import ABLATIONS, TrackingSetup, resolve_configs
+from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.transforms import make_pose, pose_inverse, pose_multiply, quat_from_yaw
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -155,6 +157,26 @@ def test_the_loop_runs_what_the_ablation_says(short, name, monkeypatch):
     assert seen["noise"] == ("off" if name == "exact" else "mild") == record["noise"]
     assert record["samples"] == seen["configs"][Mode.STATIONARY].num_samples
     json.dumps(record, allow_nan=False)
+
+
+def test_a_payload_is_in_the_plants_hands_alone():
+    morphology = make_morphology("g1")
+    setup = TrackingSetup("g1", "arms")
+    bare = make_loaded_model(morphology, setup, "empty")
+    loaded = make_loaded_model(morphology, dataclasses.replace(setup, payload=2.0), "empty")
+    assert loaded.body_subtreemass[0] - bare.body_subtreemass[0] == pytest.approx(4.0)
+    heavier = np.flatnonzero(loaded.body_mass != bare.body_mass)
+    sites = [morphology.frames[name] for name in ("left_wrist", "right_wrist")]
+    assert {int(bare.site(site).bodyid[0]) for site in sites} == set(heavier.tolist())
+    assert setup.compute_key(0) != dataclasses.replace(setup, payload=2.0).compute_key(0)
+    assert not dataclasses.replace(setup, payload=2.0).is_standard
+
+
+def test_where_a_policys_file_lies_is_not_part_of_the_key():
+    setup = TrackingSetup("g1", "squat", low_level="falcon")
+    moved = dataclasses.replace(setup, low_level_path="/elsewhere/falcon.onnx")
+    assert setup.compute_key(0) == moved.compute_key(0)
+    assert not setup.is_standard
 
 
 def test_a_run_knows_its_physics_steps(short):

@@ -61,6 +61,7 @@ class BenchConfig:
         warmup: Solves before them.
         preset: Preset of the retargeter.
         low_level: Low-level policy; empty for the robot's own.
+        low_level_path: Its file; empty for its default.
         scene: Scene; its fixed boxes are obstacles.
         noise: Preset of the sensors' noise.
         seed: Seed of sensors and samples.
@@ -75,6 +76,7 @@ class BenchConfig:
     warmup: int = 20
     preset: str = "default"
     low_level: str = ""
+    low_level_path: str = ""
     scene: str = "empty"
     noise: str = "mild"
     seed: int = 0
@@ -153,6 +155,7 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
     """
     morphology = make_morphology(config.robot)
     low_level = config.low_level or morphology.policies[0]
+    path = config.low_level_path or None
     settings = RetargeterConfig(
         num_samples=config.samples,
         horizon=config.horizon,
@@ -160,9 +163,9 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
         preset=config.preset,
         seed=config.seed,
     )
-    info = RobotInfo("bench", morphology, low_level, None, config.scene, 50, config.seed)
+    info = RobotInfo("bench", morphology, low_level, path, config.scene, 50, config.seed)
     plant = SimulationConfig(scene=config.scene, noise=config.noise, seed=config.seed)
-    loop = PolicyLoop(morphology, Simulation(morphology, plant), make_policy(low_level))
+    loop = PolicyLoop(morphology, Simulation(morphology, plant), make_policy(low_level, path))
     teleoperation = Teleoperation(TeleoperationConfig(retargeter=settings), info)
     retargeter = teleoperation.retargeter
     assert isinstance(retargeter, MpcRetargeter)
@@ -291,6 +294,7 @@ def make_parser() -> argparse.ArgumentParser:
     ):
         add(f"--{name}", default=defaults[name], help=f"{text} (default: {defaults[name]})")
     add("--low-level", default="", help="low-level policy (default: the robot's own)")
+    add("--low-level-path", default="", help="file of the low-level policy (default: its own)")
     add("--json", type=Path, help="file for the figures; times in ms (default: none)")
     add("--profile", action="store_true", help="print where the time of a step goes")
     return parser

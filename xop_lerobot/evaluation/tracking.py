@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from time import perf_counter
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from xop_lerobot.errors import UnknownName
@@ -176,6 +177,19 @@ def get_scenario(name: str) -> Scenario:
     return SCENARIOS[name]
 
 
+def make_loaded_model(morphology: Morphology, setup: TrackingSetup, scene: str) -> mujoco.MjModel:
+    """Make the plant's model, with the payload in its hands."""
+    model = build_model(morphology, "full", scene=scene)
+    if setup.payload:
+        for name in FRAMES[1:]:
+            hand = int(model.site(morphology.frames[name]).bodyid[0])
+            mass = model.body_mass[hand]
+            model.body_inertia[hand] *= (mass + setup.payload) / mass
+            model.body_mass[hand] = mass + setup.payload
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
 def run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory]:
     """Run one scenario in lock-step.
 
@@ -189,9 +203,11 @@ def run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory
     scenario = get_scenario(setup.scenario)
     morphology = make_tuned_morphology(setup)
     low_level = setup.low_level or morphology.policies[0]
+    path = setup.low_level_path or None
     config = SimulationConfig(scene=scenario.scene, noise=setup.resolved_noise, seed=seed)
-    loop = PolicyLoop(morphology, Simulation(morphology, config), make_policy(low_level))
-    info = RobotInfo(morphology.name, morphology, low_level, None, scenario.scene, setup.fps, seed)
+    plant = Simulation(morphology, config, model=make_loaded_model(morphology, setup, config.scene))
+    loop = PolicyLoop(morphology, plant, make_policy(low_level, path))
+    info = RobotInfo(morphology.name, morphology, low_level, path, scenario.scene, setup.fps, seed)
     retargeter = make_retargeter_config(setup, seed)
     teleoperation = Teleoperation(TeleoperationConfig(retargeter=retargeter), info)
     try:

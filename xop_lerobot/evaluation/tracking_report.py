@@ -95,6 +95,7 @@ ARMS_COLUMNS = {
     "after, p95 [cm]": "after_p95_cm",
     "final [cm]": "final_cm",
     "hands, median [cm]": "hand_cm",
+    "foot [cm]": "foot_cm",
     "tilt, worst [°]": "tilt_deg",
 }
 SUMMED = ("falls", "collisions", "goals", "collided_goals", "arrived_goals")

@@ -108,8 +108,10 @@ class TrackingSetup:
         preset: Preset of the retargeter.
         sync: Whether the state is synchronised.
         low_level: Name of the low-level policy; empty for the robot's own.
+        low_level_path: File of the low-level policy; empty for its default.
         hold: How long goals are held [s].
         goals: Number of goals of the scenario `room`.
+        payload: Mass that each hand carries, of which the planner knows nothing [kg].
         fps: Rate of the control loop [Hz].
         overrides: Further settings of `MpcConfig`, see `override_config`.
     """
@@ -121,15 +123,18 @@ class TrackingSetup:
     preset: str = "default"
     sync: bool = True
     low_level: str = ""
+    low_level_path: str = ""
     hold: float = 10.0
     goals: int = 10
+    payload: float = 0.0
     fps: int = 25
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def compute_key(self, seed: int) -> str:
         """A name of the run with `seed` that changes with any of its resolved settings."""
         configs = {mode.name: dataclasses.asdict(each) for mode, each in self.resolve().items()}
-        settings = [dataclasses.asdict(self), configs]
+        own = dataclasses.replace(self, low_level_path="")  # where it lies tells nothing
+        settings = [dataclasses.asdict(own), configs]
         text = json.dumps(settings, sort_keys=True, default=str)
         digest = hashlib.sha256(text.encode()).hexdigest()[:8]
         return f"{self.robot}/{self.scenario}/{self.ablation}/{seed}/{digest}"
@@ -142,7 +147,8 @@ class TrackingSetup:
     def is_standard(self) -> bool:
         """Whether the run belongs into the documents: nothing was set but by the ablation."""
         standard = TrackingSetup(self.robot, self.scenario, self.ablation)
-        return dataclasses.replace(self, hold=standard.hold, goals=standard.goals) == standard
+        free = {name: getattr(standard, name) for name in ("hold", "goals")}
+        return dataclasses.replace(self, **free) == standard
 
     @property
     def resolved_noise(self) -> str:
