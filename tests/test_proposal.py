@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,7 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from xop_lerobot.command import Mode
+from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.costs import SupportArea
 from xop_lerobot.retarget.decision import DecisionSpace
@@ -143,10 +148,45 @@ def test_a_batch_equals_one_at_a_time(parts, name, mode):
 
 
 @robots
-def test_stationary_mode_has_no_velocities(parts, name):
+def test_in_stationary_mode_velocities_sway_or_do_nothing(parts, name):
     model = parts[name].command_model
-    assert not (model.acting(Mode.STATIONARY) & model.is_velocity()).any()
+    acting = model.acting(Mode.STATIONARY) & model.is_velocity()
+    np.testing.assert_array_equal(acting, parts[name].space.sway > 0)
     assert (model.acting(Mode.MOBILE) & model.is_velocity()).any()
+
+
+def test_a_sway_shifts_the_base_and_stops(parts):
+    """From where it stands under one velocity to where it comes to stand under another."""
+    p = parts["g1"]
+    qpos = p.qpos.copy()
+    qpos[3:7] = quat_from_yaw(np.pi / 2)
+    settled, command = p.space.neutral.copy(), p.space.neutral.copy()
+    settled[4], command[4] = 0.1, 0.2
+    gain = p.morphology.effects[4].sway_s
+    for dt, share in ((0.3, 1 - np.exp(-1)), (10.0, 1.0)):
+        got = p.command_model.extrapolate(qpos, command, dt, Mode.STATIONARY, settled=settled)
+        np.testing.assert_allclose(got[:2] - qpos[:2], [0, 0.1 * gain * share], atol=1e-5)
+    stays = p.command_model.extrapolate(qpos, settled, 10.0, Mode.STATIONARY, settled=settled)
+    np.testing.assert_allclose(stays[:2], qpos[:2], atol=1e-12)
+
+
+def test_the_policy_sways_as_its_effects_say(parts):
+    """The command model's displacement against the robot's, standing, to a third of it."""
+    p = parts["g1"]
+    loop = PolicyLoop(p.morphology, Simulation(p.morphology), make_policy("default"))
+    places = []
+    for velocity in (0.0, 0.2):
+        loop.reset(seed=0)
+        command = p.space.neutral.copy()
+        command[4] = velocity
+        for _ in range(75):
+            loop.execute(dataclasses.replace(loop.action, command=command), 0.04)
+        places.append(loop.state.true_qpos[:2])
+        assert not loop.state.fallen
+    loop.close()
+    moved = places[1] - places[0]
+    assert moved[0] == pytest.approx(0.2 * p.morphology.effects[4].sway_s, rel=0.33)
+    assert abs(moved[1]) < 0.01
 
 
 # -- the proposal --------------------------------------------------------------------------
@@ -191,7 +231,7 @@ def test_stationary_leaves_the_velocities_neutral(parts, name):
     goal = p.reach(p.space.neutral, Mode.STATIONARY)
     goal[0] += 1.0
     got = p.proposal.solve(p.qpos, {"head": goal}, Mode.STATIONARY, DT)
-    velocities = p.command_model.is_velocity()
+    velocities = p.command_model.is_velocity() & (p.space.sway == 0)
     np.testing.assert_array_equal(got[velocities], p.space.neutral[velocities])
 
 
@@ -282,7 +322,7 @@ def test_a_dear_entry_is_used_less(parts):
         )
         for effort in (0.01, 1.0)
     )
-    assert abs(dear[3]) < 0.5 * abs(cheap[3])
+    assert np.abs(dear - p.space.neutral)[3:5].max() < np.abs(cheap - p.space.neutral)[3:5].max()
 
 
 # -- derivatives -----------------------------------------------------------------------------

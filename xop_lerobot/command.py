@@ -32,6 +32,10 @@ class CommandDim:
         neutral: Value at which the robot stands at rest [unit].
         max_rate: Largest change per second that the robot executes [unit/s].
         mobile_only: Whether the entry is held at `neutral` in stationary mode.
+        sway: How far a `mobile_only` entry may leave `neutral` in stationary mode all the same
+            [unit]. A policy that stands may answer to a small velocity by shifting its weight.
+        sway_rate: Largest change per second of an entry that sways, since haste makes a standing
+            policy step [unit/s].
         max_accel: Largest change of its rate per second that a teleoperation asks for [unit/s²];
             None for no limit. `CommandSmoother` keeps it.
 
@@ -48,6 +52,8 @@ class CommandDim:
     neutral: float
     max_rate: float
     mobile_only: bool = False
+    sway: float = 0.0
+    sway_rate: float = 0.1
     max_accel: float | None = None
 
     def __post_init__(self) -> None:
@@ -125,6 +131,32 @@ class CommandSpace:
         column.setflags(write=False)
         return column
 
+    @cached_property
+    def sway(self) -> np.ndarray:
+        """How far `mobile_only` entries may leave neutral in stationary mode. Shape (k,)."""
+        return self._column("sway")
+
+    def compute_max_rate(self, mode: Mode, executed: np.ndarray) -> np.ndarray:
+        """Rate limits per second after `executed`. Shapes (k,) -> (k,)."""
+        if mode is Mode.MOBILE:
+            return self.max_rate
+        # What is still faster than any sway is being stopped, which is done at the full rate.
+        sways = self.mobile_only & (np.abs(executed - self.neutral) <= self.sway + 1e-6)
+        return np.where(sways & (self.sway > 0), self._column("sway_rate"), self.max_rate)
+
+    def restrict(self, command: np.ndarray, mode: Mode) -> np.ndarray:
+        """What of a command `mode` and the bounds allow. Shapes (..., k)."""
+        if mode is Mode.STATIONARY:
+            still = np.clip(command, self.neutral - self.sway, self.neutral + self.sway)
+            command = np.where(self.mobile_only, still, command)
+        return np.clip(command, self.low, self.high)
+
+    def compute_rest(self, command: np.ndarray, mode: Mode) -> np.ndarray:
+        """What a robot that executes `command` in `mode` keeps of it to stand still. (k,)."""
+        if mode is Mode.STATIONARY:
+            return self.restrict(command, mode)
+        return np.where(self.mobile_only, self.neutral, command)
+
     def index(self, name: str) -> int:
         """Return the position of `name`.
 
@@ -141,7 +173,8 @@ class CommandSpace:
     ) -> np.ndarray:
         r"""Clip to the bounds and to :math:`|a - a_{prev}| \le \dot a_{max}\,dt`.
 
-        Entries that are `mobile_only` go to neutral in stationary mode, also at their rate.
+        Entries that are `mobile_only` go to neutral, or as near as their `sway`, in stationary
+        mode, also at their rate.
 
         Args:
             command: Wanted command. Shape (k,).
@@ -153,11 +186,10 @@ class CommandSpace:
             The command to execute. Shape (k,).
         """
         command = check_vector("command", command, len(self))
-        wanted = np.where(self.mobile_only & (mode == Mode.STATIONARY), self.neutral, command)
-        wanted = np.clip(wanted, self.low, self.high)
+        wanted = self.restrict(command, mode)
         if previous is None:
             return wanted
-        step = self.max_rate * dt
+        step = self.compute_max_rate(mode, previous) * dt
         return np.clip(wanted, previous - step, previous + step)
 
 

@@ -298,8 +298,7 @@ class Teleoperation:
 
     def _hold(self, state: RobotState) -> RobotAction:
         """Stand where and as the robot stands: velocities stop, the posture stays."""
-        space = self.morphology.command_space
-        command = np.where(space.mobile_only, space.neutral, state.command)
+        command = self.morphology.command_space.compute_rest(state.command, state.mode)
         return RobotAction(command, Mode.STATIONARY, state.arms)
 
     def _drive(self, state: RobotState, goal: Goal, head: np.ndarray, dt: float) -> RobotAction:
@@ -314,9 +313,15 @@ class Teleoperation:
 
     def _limit(self, state: RobotState, wanted: RobotAction) -> RobotAction:
         """What the robot will execute: bounds, rates and changes of rate, as it limits too."""
-        command = self._smoother.smooth(wanted.command, wanted.mode, state.command)
+        space, mode = self.morphology.command_space, wanted.mode
+        command = wanted.command
+        stands = state.mode is Mode.STATIONARY
+        if mode is Mode.STATIONARY and not stands:
+            command = space.compute_rest(command, Mode.MOBILE)
+        command = self._smoother.smooth(command, mode, state.command)
         # In stationary mode the robot stops at its full rate; told so at rest, it need not.
-        mode = wanted.mode if self._smoother.is_at_rest(command) else Mode.MOBILE
+        if not stands and not self._smoother.is_at_rest(command):
+            mode = Mode.MOBILE
         previous = RobotAction(state.command, state.mode, state.arms)
         smooth = RobotAction(command, mode, wanted.arms)
         action = limit_action(self.morphology, smooth, previous, self.dt)

@@ -27,6 +27,8 @@ class Effect:
         joint: The joint, where it acts on one.
         lag_s: Time constant with which height or joint follow the command [s].
         modes: Modes in which it has an effect at all.
+        sway_s: Where a velocity sways the base in stationary mode, by how much: displacement
+            over velocity, taken up with `lag_s` [m/(m/s)].
         effort: How dear the entry is to the kinematic proposal, over the others [1].
     """
 
@@ -34,4 +36,5 @@ class Effect:
     joint: str = ""
     lag_s: float = 0.15
     modes: tuple[Mode, ...] = (Mode.STATIONARY, Mode.MOBILE)
+    sway_s: float = 0.0
     effort: float = 1.0

@@ -127,6 +127,6 @@ class RealtimeLoop:
         if time.monotonic() - self._handed_over < _WATCHDOG_S:
             return
         action, space = self._loop.action, self.morphology.command_space
-        resting = np.where(space.mobile_only, space.neutral, action.command)
+        resting = space.compute_rest(action.command, action.mode)
         wanted = dataclasses.replace(action, command=resting, mode=Mode.STATIONARY)
         self._loop.action = limit_action(self.morphology, wanted, action, POLICY_DT)

@@ -26,7 +26,8 @@ class CommandModel:
 
     The base moves with the commanded twist around its pivot; height and joints follow with a
     first-order lag, :math:`q(t) = q + (a - q)(1 - e^{-t/T})`; all else stays. It knows neither
-    balance nor contacts: it only ranks and proposes, the rollout in MuJoCo decides.
+    balance nor contacts: it only ranks and proposes, the rollout in MuJoCo decides. In
+    stationary mode a velocity that may sway the base displaces it by that much, with a lag.
 
     Args:
         model: The robot's model.
@@ -61,9 +62,10 @@ class CommandModel:
         self._lag = np.array([effect.lag_s for effect in effects])
         self._modes = {
             mode: np.array([mode in effect.modes for effect in effects])
-            & ~(space.mobile_only & (mode == Mode.STATIONARY))
+            & ~(space.mobile_only & (space.sway == 0) & (mode == Mode.STATIONARY))
             for mode in Mode
         }
+        self._sway = np.array([effect.sway_s for effect in effects])
 
     def acting(self, mode: Mode) -> np.ndarray:
         """Which free entries have an effect in `mode`. Shape (k,), bool."""
@@ -86,21 +88,30 @@ class CommandModel:
             twist[..., axis] += command[..., i]
         return twist
 
+    def read(self, qpos: np.ndarray) -> np.ndarray:
+        """Height and joint angles that the entries act on; 0 for velocities. (nq,) -> (k,)."""
+        return np.where(self._is_velocity, 0.0, qpos[self._address])
+
+    def settle(self, settled: np.ndarray, command: np.ndarray, dt: float) -> np.ndarray:
+        """Command that the robot has taken up, with its lags, after `dt` [s] more. (..., k)."""
+        return command + (settled - command) * np.exp(-dt / self._lag)
+
     def _ramp(
-        self, command: np.ndarray, executed: np.ndarray, dt: float
+        self, command: np.ndarray, executed: np.ndarray, dt: float, mode: Mode
     ) -> tuple[np.ndarray, np.ndarray]:
         """What the rate limits make of a command: its mean for velocities, its end for the rest.
 
         Returns:
             The effective command and its derivative by the command. Shapes (..., k).
         """
-        reach = self.space.max_rate * dt
+        reach = self.space.compute_max_rate(mode, executed) * dt
         reached = np.clip(command - executed, -reach, reach)
         ramp = np.abs(reached) / reach  # share of the time spent on the ramp
         mean = reached * (1 - ramp / 2)
         inside = np.abs(command - executed) <= reach
-        slope = np.where(self._is_velocity, 1 - ramp, 1.0) * inside
-        return executed + np.where(self._is_velocity, mean, reached), slope
+        drives = self._is_velocity & (mode is Mode.MOBILE)
+        slope = np.where(drives, 1 - ramp, 1.0) * inside
+        return executed + np.where(drives, mean, reached), slope
 
     def extrapolate(
         self,
@@ -110,6 +121,8 @@ class CommandModel:
         mode: Mode,
         drift: np.ndarray | None = None,
         executed: np.ndarray | None = None,
+        offset: np.ndarray | None = None,
+        settled: np.ndarray | None = None,
     ) -> np.ndarray:
         """Compute the configuration after `dt` of a command.
 
@@ -121,19 +134,26 @@ class CommandModel:
             drift: Base velocity beyond the commanded one, as `compute_twist`. Shape (3,).
             executed: Command executed now, from which the robot ramps at its rate limits to
                 `command`; None where the command is executed already. Shape (..., k).
+            offset: Where heights and joints come to rest beside their command. Shape (k,).
+            settled: Command under which the base has come to stand where it is, from which it
+                sways; neutral by default. Shape (..., k).
 
         Returns:
             Configurations then. Shape (..., nq).
         """
         shape = np.broadcast_shapes(qpos.shape[:-1], command.shape[:-1])
         if executed is not None:
-            command, _ = self._ramp(command, executed, dt)
+            command, _ = self._ramp(command, executed, dt, mode)
         result = np.broadcast_to(qpos, (*shape, qpos.shape[-1])).copy()
         acting = self.acting(mode)
         index = np.flatnonzero(acting & self._follows)
         share, address = 1 - np.exp(-dt / self._lag[index]), self._address[index]
-        result[..., address] += share * (command[..., index] - result[..., address])
+        target = command[..., index] if offset is None else command[..., index] + offset[index]
+        result[..., address] += share * (target - result[..., address])
         if not (acting & self._is_velocity).any():
+            return result
+        if mode is Mode.STATIONARY:
+            self._sway_base(result, command, settled, dt)
             return result
         twist = self.compute_twist(command) + (0 if drift is None else drift)
         forward, left, turn = twist[..., 0], twist[..., 1], twist[..., 2]
@@ -147,6 +167,17 @@ class CommandModel:
             result[..., 1] += self.pivot * (np.sin(yaw) - np.sin(yaw + turn * dt))
         result[..., 3:7] = quat_multiply(quat_from_yaw(turn * dt), result[..., 3:7])
         return result
+
+    def _sway_base(
+        self, qpos: np.ndarray, command: np.ndarray, settled: np.ndarray | None, dt: float
+    ) -> None:
+        """Shift the base over standing feet, in place."""
+        settled = self.space.neutral if settled is None else settled
+        shift = self.compute_twist(self._sway * (1 - np.exp(-dt / self._lag)) * (command - settled))
+        yaw = quat_yaw(qpos[..., 3:7])
+        x, y = np.cos(yaw), np.sin(yaw)
+        qpos[..., 0] += shift[..., 0] * x - shift[..., 1] * y
+        qpos[..., 1] += shift[..., 0] * y + shift[..., 1] * x
 
     def compute_jacobian(
         self,
@@ -167,16 +198,23 @@ class CommandModel:
         """
         slope = np.ones(len(command))
         if executed is not None:
-            command, slope = self._ramp(command, executed, dt)
+            command, slope = self._ramp(command, executed, dt, mode)
         acting = self.acting(mode)
         jacobian = np.zeros((self._nv, len(command)))
         index = np.flatnonzero(acting & self._follows)
         jacobian[self._dof[index], index] = (1 - np.exp(-dt / self._lag[index])) * slope[index]
         if not (acting & self._is_velocity).any():
             return jacobian
+        yaw = float(quat_yaw(qpos[3:7]))
+        if mode is Mode.STATIONARY:
+            gain = self._sway * (1 - np.exp(-dt / self._lag)) * slope
+            x, y = math.cos(yaw), math.sin(yaw)
+            for i, acts in self._twist:
+                if acting[i] and acts != _TURN:
+                    jacobian[:2, i] = gain[i] * np.array(((x, y), (-y, x))[acts])
+            return jacobian
         twist = self.compute_twist(command) + (0 if drift is None else drift)
         forward, left, turn = (float(value) for value in twist)
-        yaw = float(quat_yaw(qpos[3:7]))
         middle, end = yaw + turn * dt / 2, yaw + turn * dt
         x, y = math.cos(middle), math.sin(middle)
         across = dt * dt / 2

@@ -11,6 +11,8 @@ from xop_lerobot.morphology.morphology import Morphology
 
 ARM_LAG_S = 0.1
 """Time constant with which arm joints follow their targets, to first order [s]."""
+ARM_EFFORT = 3.0
+"""How dear arm joints are to the kinematic proposal, away from their rest: they unwind in time."""
 ARM_MAX_RATE = 3.0
 """Largest speed of arm targets that the controller plans with, as the arms' IK [rad/s]."""
 
@@ -43,7 +45,9 @@ class DecisionSpace:
             )
         self.num_commands = len(morphology.command_space)
         self.space = CommandSpace((*morphology.command_space.dims, *dims))
-        arm_effects = (Effect(Acts.JOINT, name, lag_s=ARM_LAG_S) for name in self.joints)
+        arm_effects = (
+            Effect(Acts.JOINT, name, lag_s=ARM_LAG_S, effort=ARM_EFFORT) for name in self.joints
+        )
         self.effects = (*morphology.effects, *arm_effects)
 
     def make_mask(self, body: tuple[str, ...]) -> np.ndarray:

@@ -78,6 +78,8 @@ class DirectRetargeter(Retargeter):
         yaw = quat_yaw(state.qpos[3:7])
         forward = np.cos(yaw) * velocity[0] + np.sin(yaw) * velocity[1]
         left = np.cos(yaw) * velocity[1] - np.sin(yaw) * velocity[0]
+        if goal.mode is Mode.STATIONARY:
+            return self.space.neutral
         values = {Acts.FORWARD: forward, Acts.LEFT: left, Acts.TURN: velocity[5]}
         command = np.array([values.get(e.acts, 0.0) for e in self.command_model.effects])
         return np.where(self.command_model.acting(goal.mode), command, self.space.neutral)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from xop_lerobot.retarget.costs.upright import make_level
 from xop_lerobot.state import Goal
 from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
 
@@ -29,6 +30,20 @@ def hold_near(goal: Goal, poses: Mapping[str, np.ndarray], reach: float) -> Goal
             held = pose[:3] + np.array([share, share, 1.0]) * offset
             near[name] = make_pose(held, near[name][3:])
     return dataclasses.replace(goal, poses=near)
+
+
+def hold_level(goal: Goal, frames: Iterable[str]) -> Goal:
+    """Turn the goals of `frames` so that they are level, and only turn about the vertical.
+
+    A tilt that is not to be followed shall not compete with the constraint that forbids it.
+    """
+    poses, velocities = dict(goal.poses), dict(goal.velocities)
+    for name in frames:
+        if name in poses:
+            poses[name] = make_level(poses[name])
+        if name in velocities:
+            velocities[name] = velocities[name] * [1, 1, 1, 0, 0, 1]
+    return dataclasses.replace(goal, poses=poses, velocities=velocities)
 
 
 def preview(

@@ -21,9 +21,10 @@ from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.drift import DriftObserver
-from xop_lerobot.retarget.horizon_goals import hold_near, preview
+from xop_lerobot.retarget.horizon_goals import hold_level, hold_near, preview
 from xop_lerobot.retarget.intervention import Verdict, judge
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
+from xop_lerobot.retarget.offset import OffsetObserver
 from xop_lerobot.retarget.optimizer import SamplingOptimizer, build_optimizer
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
 from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
@@ -71,6 +72,7 @@ class MpcRetargeter(Retargeter):
             model, self.space, self.decision.effects, morphology.pivot
         )
         self.drift = DriftObserver(self.command_model)
+        self.offset = OffsetObserver(self.command_model)
         hull = morphology.hull_points
         self._collision = CollisionCost(
             make_obstacles(model) if obstacles is None else obstacles, hull
@@ -150,7 +152,7 @@ class MpcRetargeter(Retargeter):
                     self.rollout.model,
                     self.command_model,
                     self.sites,
-                    make_proposal_weights(each.weights),
+                    make_proposal_weights(each.weights, upright=bool(self._find_upright())),
                     self.support,
                     self.morphology.base_body,
                 )
@@ -188,6 +190,7 @@ class MpcRetargeter(Retargeter):
             self._rng = np.random.default_rng(self._seed)
             self._last = None
             self.drift.reset()
+            self.offset.reset(self.decision.join(state.command, state.arms))
             for planner in self._planners.values():
                 planner.reset(self.decision.join(state.command, state.arms))
 
@@ -205,19 +208,21 @@ class MpcRetargeter(Retargeter):
         self._warm_start(np.where(acting, executed, held), state.time, mode)
         if config.observe_drift:
             self.drift.update(state.time, state.qpos, executed, mode is Mode.MOBILE)
-        drift = self.drift.drift if config.observe_drift else np.zeros(3)
+            self.offset.update(state.time, state.qpos, executed)
+        drift = self.drift.drift
         poses = self.readings.compute_poses(state.qpos, self.sites)
         goal = hold_near(goal, poses, config.reach)
+        goal = hold_level(goal, self._find_upright())
         wanted = self._compute_wanted_velocity(poses, goal, config)
         proposal = self._propose(state, goal, executed, held, drift, wanted, config)
         candidates = self._collect_candidates(state, goal, executed, proposal, config)
         candidates = np.where(acting, candidates, held)
         noise = self._noise[mode] * acting * self._compute_noise_share(poses, goal, config)
         samples = planner.sample(self._rng, noise, candidates)
-        commands = np.where(acting, samples.commands, held)
+        commands = self.space.restrict(np.where(acting, samples.commands, held), mode)
         sampled = perf_counter()
 
-        prediction = self._predict(state, self._limit_rates(executed, commands), mode)
+        prediction = self._predict(state, self._limit_rates(executed, commands, mode), mode)
         rolled = perf_counter()
         with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
             evaluation = self._evaluate(
@@ -235,7 +240,7 @@ class MpcRetargeter(Retargeter):
         touches = self._collision.find_touches(evaluation)
         verdict = judge(weights, costs, falls, touches, min(stop, len(costs) - 1))
         planned = self._apply(verdict, planner, samples.commands, executed)
-        planned = np.where(acting, planned, held)
+        planned = self.space.restrict(np.where(acting, planned, held), mode)
         best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
         end = perf_counter()
 
@@ -261,6 +266,11 @@ class MpcRetargeter(Retargeter):
                 "cost": end - rolled,
             },
         )
+
+    def _find_upright(self) -> tuple[str, ...]:
+        """Targets that are hands to be kept level."""
+        hands = {arm.frame for arm in self.morphology.arms}
+        return tuple(hands & set(self.sites)) if "upright" in self.constraints else ()
 
     def _compute_held(self, executed: np.ndarray, mode: Mode) -> np.ndarray:
         """What entries do that are not decided: nothing; the rest of the body stays. (n,)."""
@@ -315,6 +325,8 @@ class MpcRetargeter(Retargeter):
             start=self._planners[goal.mode].commands[0],
             drift=drift,
             executed=executed,
+            offset=self.offset.offset,
+            settled=self.offset.settled,
             wanted_velocity=wanted,
         )
         if not np.isfinite(proposal).all():
@@ -360,9 +372,9 @@ class MpcRetargeter(Retargeter):
             error = max(error, np.linalg.norm(poses[name][:3] - goals[0, :3]), 0.5 * turn)
         return float(np.clip(error / config.full_noise_error, config.min_noise, 1.0))
 
-    def _limit_rates(self, executed: np.ndarray, commands: np.ndarray) -> np.ndarray:
+    def _limit_rates(self, executed: np.ndarray, commands: np.ndarray, mode: Mode) -> np.ndarray:
         """What the robot will make of command sequences. Shapes (n,), (K, H, n)."""
-        step = self.space.max_rate * POLICY_DT
+        step = self.space.compute_max_rate(mode, executed) * POLICY_DT
         horizon = commands.shape[1]
         if (commands == commands[:, :1]).all():  # a command that is held is approached straight
             reach = step * np.arange(1, horizon + 1)[:, None]
@@ -413,6 +425,10 @@ class MpcRetargeter(Retargeter):
             goal.mode,
             drift,
             executed=prediction.commands[:, -1],
+            offset=self.offset.offset,
+            settled=self.command_model.settle(
+                self.offset.settled, commands[:, -1], config.horizon * POLICY_DT
+            ),
         )
         sites = {name: site for name, site in self.sites.items() if name in goal.poses}
         ahead = np.arange(config.horizon + 1) * POLICY_DT
@@ -440,7 +456,7 @@ class MpcRetargeter(Retargeter):
             mode=goal.mode,
             dt=POLICY_DT,
             weights=config.weights,
-            upright=tuple(sites) if "upright" in self.constraints else (),
+            upright=tuple(name for name in self._find_upright() if name in sites),
         )
 
     def _apply(

@@ -32,6 +32,7 @@ class ProposalWeights:
         position: Of the position error along x, y, z [1/m].
         orientation: Of roll, pitch and heading, as in `heading_error` [1/rad].
         effort: Of the command's distance from neutral, over its scale [1].
+        change: Of its distance from the executed command, over its scale [1].
         support: Of the centre of mass beyond the support area [1/m].
         lean: Of the centre of mass from where it rests on the base [1/m].
         lateral: Of the wanted velocity across the heading of a base on wheels [s/m].
@@ -40,25 +41,42 @@ class ProposalWeights:
     position: tuple[float, float, float] = (1.0, 1.0, 1.0)
     orientation: tuple[float, float, float] = (0.4, 0.4, 0.4)
     effort: float = 0.02
+    change: float = 0.0
     support: float = 30.0
     lean: float = 0.0
     lateral: float = 0.0
 
 
-def make_proposal_weights(weights: CostWeights) -> ProposalWeights:
-    """Weights of the least squares that match those of the tracking cost."""
+def make_proposal_weights(weights: CostWeights, *, upright: bool = False) -> ProposalWeights:
+    """Weights of the least squares that match those of the cost.
+
+    Args:
+        weights: Weights of the cost.
+        upright: Whether hands are kept level. Their goals are level then, and the weight of the
+            constraint adds to that of their tilt.
+    """
     turn = math.sqrt(weights.orientation / weights.position)
-    tilt = turn * math.sqrt(weights.tilt_share)
+    tilted = weights.orientation * weights.tilt_share + (weights.upright if upright else 0.0)
+    tilt = math.sqrt(tilted / weights.position)
     lean = math.sqrt(weights.lean / weights.position)
     lateral = math.sqrt(weights.lateral / weights.position)
-    return ProposalWeights(orientation=(tilt, tilt, turn), lean=lean, lateral=lateral)
+    change = math.sqrt(weights.change / weights.position)
+    return ProposalWeights(
+        orientation=(tilt, tilt, turn), change=change, lean=lean, lateral=lateral
+    )
 
 
 class KinematicProposal:
-    r"""Solves :math:`\min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \|\rho (a - a_0)/s\|^2`.
+    r"""Solves the least squares of the command that brings the tracked frames to their goals.
+
+    .. math::
+
+        \min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \|\rho (a - a_0)/s\|^2
+        + \|\delta (a - a_{exec})/s\|^2
 
     φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` the neutral
-    command, s half the range of each entry and ρ its effort. A few
+    command, s half the range of each entry and ρ its effort; δ, the weight of a change, damps
+    what near a singularity would take large motions for little. A few
     Levenberg-Marquardt steps within the bounds, each a small quadratic program solved by DAQP;
     the Jacobian is :math:`J_{site}(\phi)\,\partial\phi/\partial a`, by MuJoCo.
 
@@ -102,6 +120,8 @@ class KinematicProposal:
         start: np.ndarray | None = None,
         drift: np.ndarray | None = None,
         executed: np.ndarray | None = None,
+        offset: np.ndarray | None = None,
+        settled: np.ndarray | None = None,
         wanted_velocity: np.ndarray | None = None,
         free: np.ndarray | None = None,
     ) -> np.ndarray:
@@ -115,6 +135,8 @@ class KinematicProposal:
             start: Where to start the iteration; neutral by default. Shape (k,).
             drift: Base velocity beyond the commanded one. Shape (3,).
             executed: Command executed now, from which the robot ramps. Shape (k,).
+            offset: As for `CommandModel.extrapolate`. Shape (k,).
+            settled: As for `CommandModel.extrapolate`. Shape (k,).
             wanted_velocity: Velocity that a base on wheels shall be able to give [m/s]. (2,).
             free: Which entries may move; all that act by default. Shape (k,), bool.
 
@@ -129,27 +151,39 @@ class KinematicProposal:
             return command
         low, high = space.low, space.high
         if executed is not None:  # beyond what can be reached in time nothing would change
-            low = np.maximum(low, executed - space.max_rate * dt)
-            high = np.minimum(high, executed + space.max_rate * dt)
+            reach = space.compute_max_rate(mode, executed) * dt
+            low, high = np.maximum(low, executed - reach), np.minimum(high, executed + reach)
         low, high = low[index], high[index]
         high = np.maximum(low, high)  # an executed command may be out of the bounds
         command[index] = np.clip(command[index], low, high)
         scale, effort = self.scale[index], self.weights.effort * self._effort[index]
+        change = self.weights.change if executed is not None else 0.0
+        last = command[index] if executed is None else executed[index]
         none, sense = np.zeros((0, len(index))), np.zeros(len(index), dtype=np.int32)
 
         best, least, damping = command, np.inf, _DAMPING
         matrix = gradient = np.zeros(0)
         for _ in range(self.iterations):
             residual, jacobian = self.linearise(
-                qpos, command, goals, mode, dt, drift, executed, wanted_velocity
+                qpos,
+                command,
+                goals,
+                mode,
+                dt,
+                drift=drift,
+                executed=executed,
+                offset=offset,
+                settled=settled,
+                wanted_velocity=wanted_velocity,
             )
             share = (command[index] - space.neutral[index]) / scale
-            cost = residual @ residual + np.square(effort * share).sum()
+            moved = change * (command[index] - last) / scale
+            cost = residual @ residual + np.square(effort * share).sum() + moved @ moved
             if cost < least:  # a better point: linearise there, trust the step more
                 best, least, damping = command, cost, damping / 4
                 scaled = jacobian[:, index] * scale
-                matrix = scaled.T @ scaled + np.diag(np.square(effort))
-                gradient = scaled.T @ residual + np.square(effort) * share
+                matrix = scaled.T @ scaled + np.diag(np.square(effort) + change**2)
+                gradient = scaled.T @ residual + np.square(effort) * share + change * moved
             elif not np.isfinite(least):
                 return command  # not a number: nothing to improve on
             else:
@@ -170,8 +204,11 @@ class KinematicProposal:
         goals: Mapping[str, np.ndarray],
         mode: Mode,
         dt: float,
+        *,
         drift: np.ndarray | None = None,
         executed: np.ndarray | None = None,
+        offset: np.ndarray | None = None,
+        settled: np.ndarray | None = None,
         wanted_velocity: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the weighted errors after `dt` of a command and their derivative by it.
@@ -182,7 +219,7 @@ class KinematicProposal:
             Residuals, shape (m,), and their Jacobian, shape (m, k).
         """
         model, weights = self.command_model, self.weights
-        future = model.extrapolate(qpos, command, dt, mode, drift, executed)
+        future = model.extrapolate(qpos, command, dt, mode, drift, executed, offset, settled)
         motion = model.compute_jacobian(qpos, command, dt, mode, drift, executed)
         self._linearisation.update(future)
         residuals, jacobians = [], []

@@ -24,7 +24,6 @@ class CommandSmoother:
 
     def __init__(self, space: CommandSpace, dt: float) -> None:
         self.space, self.dt = space, dt
-        self._reach = space.max_rate * dt  # largest step
         self._gain = space.max_accel * dt * dt  # largest change of the step
         self.reset()
 
@@ -46,11 +45,11 @@ class CommandSmoother:
         """
         space = self.space
         command = check_vector("command", command, len(space))
-        wanted = np.where(space.mobile_only & (mode == Mode.STATIONARY), space.neutral, command)
-        wanted = np.clip(wanted, space.low, space.high)
+        wanted = space.restrict(command, mode)
         if self._sent is None or not np.array_equal(executed, self._sent):
             self._step = np.zeros(len(space))  # somebody else drove the robot
-        step = np.clip(wanted - executed, -self._reach, self._reach)
+        reach = space.compute_max_rate(mode, executed) * self.dt  # largest step
+        step = np.clip(wanted - executed, -reach, reach)
         step = np.sign(step) * np.minimum(
             np.abs(step), compute_braking_step(np.abs(wanted - executed), self._gain)
         )
@@ -58,11 +57,11 @@ class CommandSmoother:
         # What still moves towards a bound must be able to stop there.
         rise = compute_braking_step(np.maximum(space.high - executed, 0), self._gain)
         fall = compute_braking_step(np.maximum(executed - space.low, 0), self._gain)
-        step = np.clip(step, -np.minimum(fall, self._reach), np.minimum(rise, self._reach))
+        step = np.clip(step, -np.minimum(fall, reach), np.minimum(rise, reach))
         return executed + step
 
     def is_at_rest(self, command: np.ndarray) -> bool:
-        """Whether the velocities of `command` are neutral, as in stationary mode. Shape (k,)."""
+        """Whether the velocities of `command` are neutral. Shape (k,)."""
         moving = self.space.mobile_only & (np.abs(command - self.space.neutral) > 1e-9)
         return not moving.any()
 

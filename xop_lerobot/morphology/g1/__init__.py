@@ -44,17 +44,49 @@ class G1(Morphology):
     name = "g1"
     command_space = CommandSpace(
         (
-            CommandDim("height", "height.pos", "m", 0.53, 0.78, 0.75, 0.5),
-            CommandDim("waist_yaw", "waist_yaw.pos", "rad", -1.0, 1.0, 0.0, 2.0),
-            CommandDim("waist_roll", "waist_roll.pos", "rad", -0.5, 0.5, 0.0, 2.0),
-            CommandDim("waist_pitch", "waist_pitch.pos", "rad", -0.5, 0.5, 0.0, 2.0),
+            CommandDim("height", "height.pos", "m", 0.53, 0.78, 0.75, 0.5, max_accel=5.0),
+            CommandDim("waist_yaw", "waist_yaw.pos", "rad", -1.0, 1.0, 0.0, 2.0, max_accel=20.0),
+            CommandDim("waist_roll", "waist_roll.pos", "rad", -0.5, 0.5, 0.0, 2.0, max_accel=20.0),
             CommandDim(
-                "vx", "x.vel", "m/s", -1.0, 1.0, 0.0, 3.0, mobile_only=True, sway=0.3, sway_rate=0.2
+                "waist_pitch", "waist_pitch.pos", "rad", -0.5, 0.5, 0.0, 2.0, max_accel=20.0
             ),
             CommandDim(
-                "vy", "y.vel", "m/s", -0.6, 0.6, 0.0, 3.0, mobile_only=True, sway=0.2, sway_rate=0.2
+                "vx",
+                "x.vel",
+                "m/s",
+                -1.0,
+                1.0,
+                0.0,
+                3.0,
+                mobile_only=True,
+                sway=0.3,
+                sway_rate=0.2,
+                max_accel=60.0,
             ),
-            CommandDim("yaw_rate", "theta.vel", "rad/s", -1.0, 1.0, 0.0, 5.0, mobile_only=True),
+            CommandDim(
+                "vy",
+                "y.vel",
+                "m/s",
+                -0.6,
+                0.6,
+                0.0,
+                3.0,
+                mobile_only=True,
+                sway=0.2,
+                sway_rate=0.2,
+                max_accel=60.0,
+            ),
+            CommandDim(
+                "yaw_rate",
+                "theta.vel",
+                "rad/s",
+                -1.0,
+                1.0,
+                0.0,
+                5.0,
+                mobile_only=True,
+                max_accel=100.0,
+            ),
         )
     )
     policies = ("default", "falcon")

@@ -14,8 +14,9 @@ EFFECTS = (
     Effect(Acts.JOINT, "waist_yaw_joint", lag_s=0.2, modes=STATIONARY),
     Effect(Acts.JOINT, "waist_roll_joint", lag_s=0.1, effort=5.0),
     Effect(Acts.JOINT, "waist_pitch_joint", lag_s=0.1, effort=2.0),
-    Effect(Acts.FORWARD),
-    Effect(Acts.LEFT),
+    # While standing it answers to a small velocity by shifting its weight, 2.4 cm for 0.1 m/s.
+    Effect(Acts.FORWARD, lag_s=0.3, sway_s=0.24, effort=0.3),
+    Effect(Acts.LEFT, lag_s=0.3, sway_s=0.22, effort=0.3),
     Effect(Acts.TURN),
 )
 
@@ -23,7 +24,8 @@ CONFIGS = {
     Mode.STATIONARY: MpcConfig(
         num_samples=16,
         horizon=8,
-        noise_std={"height": 0.03, "waist_yaw": 0.1, "waist_roll": 0.05, "waist_pitch": 0.1},
+        noise_std={"height": 0.03, "waist_yaw": 0.1, "waist_roll": 0.05, "waist_pitch": 0.1,
+                   "vx": 0.06, "vy": 0.04},
         weights=CostWeights(orientation=0.2),
     ),
     Mode.MOBILE: MpcConfig(

@@ -62,8 +62,18 @@ class RBY1(Morphology):
     command_space = CommandSpace(
         (
             # name, key, unit, low, high, neutral, largest rate and change of rate
-            CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.5, True, 30.0),
-            CommandDim("yaw_rate", "theta.vel", "rad/s", -1.5, 1.5, 0.0, 3.0, True, 60.0),
+            CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.5, mobile_only=True, max_accel=30.0),
+            CommandDim(
+                "yaw_rate",
+                "theta.vel",
+                "rad/s",
+                -1.5,
+                1.5,
+                0.0,
+                3.0,
+                mobile_only=True,
+                max_accel=60.0,
+            ),
             *_make_torso_dims(),
         )
     )

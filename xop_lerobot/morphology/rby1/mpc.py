@@ -59,8 +59,11 @@ V2_CONFIG = MpcConfig(
         **{f"torso_{i}": 0.02 for i in range(6)},
         **{f"left_arm_{i}": 0.05 for i in range(7)},
     },
-    proposal_s=1.0,
-    weights=CostWeights(orientation=0.2),
+    # Joints follow within 0.1 s: a goal further ahead would be overtaken.
+    preview_s=0.1,
+    proposal_s=0.3,
+    # A change that costs damps the wrist where two of its axes are in line.
+    weights=CostWeights(orientation=0.2, change=0.01, upright=3.0),
 )
 """Torso and left arm after the left hand; the base stands in either mode."""
 

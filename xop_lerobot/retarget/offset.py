@@ -1,0 +1,58 @@
+"""Where a robot comes to rest beside its command: observed, and counted on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.retarget.command_model import CommandModel
+
+_QUIET = 0.03  # distance of the lagged command from the command at which a robot rests, of scale
+_MAX = 0.2  # largest offset, of scale
+
+
+class OffsetObserver:
+    r"""Low-passed difference between height and joints and what was commanded, at rest.
+
+    .. math:: \bar a \leftarrow a + (\bar a - a)e^{-dt/T},\qquad
+              o \leftarrow o + (1 - e^{-dt/\tau})(q - \bar a - o)
+
+    A low-level policy holds a waist or a height beside the command, by a few hundredths, to keep
+    its balance. The short horizon sees the motion towards the command, not where it ends. With o
+    in the extrapolated terminal cost the controller has no steady offset, as with the drift of a
+    walking base. It learns only where the lagged command \bar a has caught up with a.
+
+    Args:
+        command_model: What a command does, and with what lag.
+        time_constant: τ [s].
+
+    Attributes:
+        settled: The lagged command. Shape (k,).
+        offset: o; zero for velocities. Shape (k,).
+    """
+
+    def __init__(self, command_model: CommandModel, time_constant: float = 0.6) -> None:
+        self.command_model, self.time_constant = command_model, time_constant
+        space = command_model.space
+        self._scale = (space.high - space.low) / 2
+        self.reset(space.neutral)
+
+    def reset(self, command: np.ndarray) -> None:
+        """Forget everything: the robot rests at `command`. Shape (k,)."""
+        self.settled = np.array(command, dtype=float)
+        self.offset = np.zeros(len(self.settled))
+        self._last: float | None = None
+
+    def update(self, time: float, qpos: np.ndarray, command: np.ndarray) -> None:
+        """Take the configuration at `time` [s] and the command executed since the last one."""
+        last, self._last = self._last, time
+        if last is None or time <= last:
+            return
+        dt = time - last
+        model = self.command_model
+        self.settled = model.settle(self.settled, command, dt)
+        beside = model.read(qpos) - self.settled - self.offset
+        quiet = np.abs(command - self.settled) < _QUIET * self._scale
+        learns = quiet & ~model.is_velocity() & np.isfinite(beside)
+        gain = -np.expm1(-dt / self.time_constant)
+        moved = self.offset + gain * np.where(learns, beside, 0.0)
+        self.offset = np.clip(moved, -_MAX * self._scale, _MAX * self._scale)
