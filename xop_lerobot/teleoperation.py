@@ -313,15 +313,9 @@ class Teleoperation:
 
     def _limit(self, state: RobotState, wanted: RobotAction) -> RobotAction:
         """What the robot will execute: bounds, rates and changes of rate, as it limits too."""
-        space, mode = self.morphology.command_space, wanted.mode
-        command = wanted.command
-        stands = state.mode is Mode.STATIONARY
-        if mode is Mode.STATIONARY and not stands:
-            command = space.compute_rest(command, Mode.MOBILE)
-        command = self._smoother.smooth(command, mode, state.command)
-        # In stationary mode the robot stops at its full rate; told so at rest, it need not.
-        if not stands and not self._smoother.is_at_rest(command):
-            mode = Mode.MOBILE
+        command, mode = self._smoother.smooth(
+            wanted.command, wanted.mode, state.command, state.mode
+        )
         previous = RobotAction(state.command, state.mode, state.arms)
         smooth = RobotAction(command, mode, wanted.arms)
         action = limit_action(self.morphology, smooth, previous, self.dt)

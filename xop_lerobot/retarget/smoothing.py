@@ -6,6 +6,8 @@ import numpy as np
 
 from xop_lerobot.command import CommandSpace, Mode, check_vector
 
+_AT_REST = 1e-9  # velocities up to here are neutral [their unit]
+
 
 class CommandSmoother:
     r"""Brings a command to where it is wanted within its bounds, rates and changes of rate.
@@ -14,8 +16,8 @@ class CommandSmoother:
               |a_n - 2 a_{n-1} + a_{n-2}| \le \ddot a_{max}\,dt^2
 
     It brakes in time: a wanted command that stands still is reached without overshoot, and a
-    bound is never passed. Velocities stop just so when the mode becomes stationary; therefore
-    the robot is told of that mode only once they are at rest (`smooth`).
+    bound is never passed. Velocities stop just so when the mode becomes stationary; the robot
+    itself would stop them at their full rate, so it is told of that mode once they are at rest.
 
     Args:
         space: The command space; entries without a `max_accel` are limited in their rate alone.
@@ -32,24 +34,29 @@ class CommandSmoother:
         self._sent: np.ndarray | None = None
         self._step = np.zeros(len(self.space))
 
-    def smooth(self, command: np.ndarray, mode: Mode, executed: np.ndarray) -> np.ndarray:
-        """Compute the command to send after `executed`; `note` what became of it.
+    def smooth(
+        self, command: np.ndarray, mode: Mode, executed: np.ndarray, executed_mode: Mode
+    ) -> tuple[np.ndarray, Mode]:
+        """Compute what to send after what is being executed; `note` what became of it.
 
         Args:
             command: Wanted command. Shape (k,).
             mode: Mode that is wanted.
             executed: Command being executed. Shape (k,).
+            executed_mode: Mode being executed.
 
         Returns:
-            The command to send. Shape (k,).
+            The command and the mode to send: still mobile while velocities are stopping. (k,).
         """
-        space = self.space
+        space, stops = self.space, False
         command = check_vector("command", command, len(space))
-        wanted = space.restrict(command, mode)
+        if mode is Mode.STATIONARY and executed_mode is Mode.MOBILE:
+            stops, mode = True, Mode.MOBILE
+            command = np.where(space.mobile_only, space.neutral, command)
         if self._sent is None or not np.array_equal(executed, self._sent):
             self._step = np.zeros(len(space))  # somebody else drove the robot
-        reach = space.compute_max_rate(mode, executed) * self.dt  # largest step
-        step = np.clip(wanted - executed, -reach, reach)
+        wanted = space.limit(command, None, self.dt, mode)
+        step = space.limit(command, executed, self.dt, mode) - executed
         step = np.sign(step) * np.minimum(
             np.abs(step), compute_braking_step(np.abs(wanted - executed), self._gain)
         )
@@ -57,13 +64,19 @@ class CommandSmoother:
         # What still moves towards a bound must be able to stop there.
         rise = compute_braking_step(np.maximum(space.high - executed, 0), self._gain)
         fall = compute_braking_step(np.maximum(executed - space.low, 0), self._gain)
+        reach = space.max_rate * self.dt
         step = np.clip(step, -np.minimum(fall, reach), np.minimum(rise, reach))
-        return executed + step
+        sent = executed + step
+        if stops and self._is_at_rest(executed, sent):
+            return sent, Mode.STATIONARY
+        return sent, mode
 
-    def is_at_rest(self, command: np.ndarray) -> bool:
-        """Whether the velocities of `command` are neutral. Shape (k,)."""
-        moving = self.space.mobile_only & (np.abs(command - self.space.neutral) > 1e-9)
-        return not moving.any()
+    def _is_at_rest(self, executed: np.ndarray, sent: np.ndarray) -> bool:
+        """Whether velocities are neutral, and a robot that is told to stand leaves them so."""
+        space = self.space
+        moving = space.mobile_only & (np.abs(sent - space.neutral) > _AT_REST)
+        kept = space.limit(sent, executed, self.dt, Mode.STATIONARY)
+        return not moving.any() and np.allclose(kept, sent, rtol=0, atol=_AT_REST)
 
     def note(self, executed: np.ndarray, sent: np.ndarray) -> None:
         """Take down what was sent in the end. Shapes (k,)."""
