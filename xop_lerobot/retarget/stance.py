@@ -132,10 +132,10 @@ class StanceMemory:
                 self._departure[index] = 0
                 share = 1.0
             self.places[index] += share * change
-            best = (self.config.stance_position, self.config.stance_heading)
-            self._spread[index] = tuple(
-                math.hypot(least, one * math.sqrt(share))
-                for least, one in zip(best, noise, strict=True)
+            small, config = math.sqrt(share), self.config
+            self._spread[index] = (
+                math.hypot(config.stance_position, small * noise[0]),
+                math.hypot(config.stance_heading, small * noise[1]),
             )
 
     def _has_left(self, index: int, std: tuple[float, float]) -> bool:

@@ -173,11 +173,12 @@ class StateSync:
         dt = time - self._last_time
         if not (config.recursive and 0 < dt <= config.max_gap_s):
             self._forget()
-        if self._is_new:
+        last = None if self._is_new else self._last
+        if last is None:
             dt, guess = 0.0, qpos
         else:
-            guess = self._last.qpos.copy()
-            mujoco.mj_integratePos(self.model, guess, self._last.qvel, dt)
+            guess = last.qpos.copy()
+            mujoco.mj_integratePos(self.model, guess, last.qvel, dt)
         configuration.update(guess)
         self.stance.update_contacts(configuration.data, mode, dt)
         if config.recursive:
@@ -185,9 +186,9 @@ class StateSync:
             qvel[:3] = self._bias.update(qpos[:3], qvel[:3], dt)
         velocity, variance = self._project(qvel)
         mean, carried = velocity, variance
-        if not self._is_new:
-            mean = 0.5 * (velocity + self._last.qvel)
-            change = np.square(velocity - self._last.qvel) - 2 * variance  # beyond mere noise
+        if last is not None:
+            mean = 0.5 * (velocity + last.qvel)
+            change = np.square(velocity - last.qvel) - 2 * variance  # beyond mere noise
             carried = variance + np.square(self._curvature) * np.maximum(change, 0)
         measured, restarted = self._filter.update(qpos, mean, carried, dt)
         configuration.update(measured)
