@@ -312,11 +312,13 @@ def test_a_run_that_ends_in_a_fall_has_no_figures_of_what_did_not_come():
         if each.name not in ("solve_s", "contacts")
     }
     short["fallen"] = np.arange(50) == 49
+    short["hands"] = np.where(short["fallen"][:, None], np.nan, 0.02)  # no goal after the fall
     fallen = Trajectory(**short, solve_s=trajectory.solve_s)
     metrics = compute_metrics(track, fallen, TOLERANCE)
     assert metrics["falls"] == 1
     assert metrics["arrival_s"] == math.inf
     assert math.isnan(metrics["after_max_cm"])
+    assert metrics["hand_cm"] == pytest.approx(2)
 
 
 def test_a_trajectory_checks_its_lengths():

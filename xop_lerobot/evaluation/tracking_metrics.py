@@ -195,7 +195,7 @@ def compute_metrics(
         metrics["moving_mean_deg"] = math.degrees(float(errors.angle[moving].mean()))
     travel = np.linalg.norm(trajectory.feet - trajectory.feet[0], axis=-1)
     metrics["foot_cm"] = float(travel.max()) * 100 if travel.size else 0.0
-    metrics["hand_cm"] = float(np.median(trajectory.hands)) * 100
+    metrics["hand_cm"] = float(np.nanmedian(trajectory.hands)) * 100
     w, x, y, z = trajectory.base[:, 3:].T
     metrics["tilt_deg"] = math.degrees(
         float(np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1)).max())
