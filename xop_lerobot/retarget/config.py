@@ -12,7 +12,7 @@ WEIGHTINGS = ("raw", "minmax", "ess")
 SAMPLINGS = ("gaussian", "antithetic", "sobol")
 KERNEL_MEANS = ("hold", "zero")
 SHIFTS = ("measured", "one")
-CANDIDATES = ("proposal", "direct", "previous", "stop")
+CANDIDATES = ("proposal", "paced", "direct", "previous", "stop")
 CONTROL_REFERENCES = ("proposal", "neutral", "zero")
 RETARGETERS = ("mpc", "direct")
 PRESETS = ("default", "conservative", "aggressive", "table1")
@@ -97,8 +97,10 @@ class MpcConfig:
         reach: Distance at which a goal that runs away is held [m]; beyond it more error would
             only contort the robot.
         proposal_s: Time in which the kinematic candidate wants to be at the goal [s].
-        candidates: Fixed commands that are tried beside the samples: the kinematic `proposal`,
-            the `direct` mapping, the `previous` command, which is still executed, and `stop`.
+        candidates: Fixed commands that are tried beside the samples: the kinematic `proposal`;
+            `paced`, so much of it that all entries are there at once, within two control
+            periods, for chains whose slow joints would lag behind; the `direct` mapping; the
+            `previous` command, which is still executed; and `stop`.
         control_reference: Command from which the control cost counts: the `proposal`, `neutral`,
             or `zero` as in the paper.
         observe_drift: Whether a steady drift of a walking base is observed and counted on.

@@ -27,7 +27,7 @@ from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.offset import OffsetObserver
 from xop_lerobot.retarget.optimizer import SamplingOptimizer, build_optimizer
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
-from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
+from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights, pace
 from xop_lerobot.retarget.readings import Readings
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
 from xop_lerobot.retarget.weighting import compute_effective_samples
@@ -346,6 +346,9 @@ class MpcRetargeter(Retargeter):
         for name in config.candidates:
             if name == "proposal":
                 candidates.append(proposal)
+            elif name == "paced":
+                rates = self.space.compute_max_rate(goal.mode, executed)
+                candidates.append(pace(executed, proposal, rates * 2 / config.control_hz))
             elif name == "direct":
                 command = self._map_directly(state, goal)
                 candidates.append(self.decision.join(command, state.arms))

@@ -276,3 +276,14 @@ class KinematicProposal:
         turn = quat_rotate(future[3:7], motion[3:6].T)[:, 2]
         residuals.append(np.array([self.weights.lateral * lateral]))
         jacobians.append(-self.weights.lateral * along * turn[None])
+
+
+def pace(executed: np.ndarray, wanted: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Go from one command towards another as far as no entry moves by more than its `reach`.
+
+    All entries then arrive together, and a chain keeps its shape on the way: with each at its
+    own rate, a hand tilts while the torso below it is still moving. Shapes (n,).
+    """
+    distance = np.abs(wanted - executed)
+    share = float(np.min(reach / np.maximum(distance, 1e-12), initial=1.0))
+    return executed + min(share, 1.0) * (wanted - executed)

@@ -62,6 +62,7 @@ V2_CONFIG = MpcConfig(
     # Joints follow within 0.1 s: a goal further ahead would be overtaken.
     preview_s=0.1,
     proposal_s=0.3,
+    candidates=("proposal", "paced", "previous", "stop"),
     # A change that costs damps the wrist where two of its axes are in line.
     weights=CostWeights(orientation=0.2, change=0.01, upright=3.0),
 )
