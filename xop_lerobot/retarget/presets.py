@@ -50,12 +50,13 @@ def _make_conservative(
 ) -> MpcConfig:
     """Smoother and slower: the part of the paper's w_a = 0.5.
 
-    The paper's control energy weighs the absolute command. Here it is the change of the command
-    that costs, and the proposal takes its time.
+    The paper's control energy weighs the absolute command, which would pull a standing height
+    down. Here the change of the command costs, the proposal takes its time, and the samples
+    stay near the plan.
     """
     del morphology, paper
-    weights = dataclasses.replace(config.weights, change=0.05)
-    return dataclasses.replace(config, weights=weights, proposal_s=1.8 * config.proposal_s)
+    weights = dataclasses.replace(config.weights, change=0.2)
+    return _hurry(dataclasses.replace(config, weights=weights), time=2.0, noise=0.5)
 
 
 def _make_aggressive(
@@ -64,7 +65,14 @@ def _make_aggressive(
     """Faster and rougher: the part of the paper's w_a = 0.02."""
     del morphology, paper
     weights = dataclasses.replace(config.weights, change=0.0)
-    return dataclasses.replace(config, weights=weights, proposal_s=0.6 * config.proposal_s)
+    hurried = _hurry(dataclasses.replace(config, weights=weights), time=0.7, noise=1.5)
+    return dataclasses.replace(hurried, full_noise_error=0.5 * config.full_noise_error)
+
+
+def _hurry(config: MpcConfig, time: float, noise: float) -> MpcConfig:
+    """Scale the time of the proposal and the width of the samples."""
+    noise_std = {name: noise * value for name, value in config.noise_std.items()}
+    return dataclasses.replace(config, proposal_s=time * config.proposal_s, noise_std=noise_std)
 
 
 def _make_table1(morphology: Morphology, config: MpcConfig, paper: PaperParameters) -> MpcConfig:
