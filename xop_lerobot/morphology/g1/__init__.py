@@ -44,11 +44,11 @@ class G1(Morphology):
     name = "g1"
     command_space = CommandSpace(
         (
-            CommandDim("height", "height.pos", "m", 0.53, 0.78, 0.75, 0.5, max_accel=5.0),
+            CommandDim("height", "height.pos", "m", 0.53, 0.78, 0.75, 0.25, max_accel=5.0),
             CommandDim("waist_yaw", "waist_yaw.pos", "rad", -1.0, 1.0, 0.0, 2.0, max_accel=20.0),
             CommandDim("waist_roll", "waist_roll.pos", "rad", -0.5, 0.5, 0.0, 2.0, max_accel=20.0),
             CommandDim(
-                "waist_pitch", "waist_pitch.pos", "rad", -0.5, 0.5, 0.0, 2.0, max_accel=20.0
+                "waist_pitch", "waist_pitch.pos", "rad", -0.5, 0.5, 0.0, 0.7, max_accel=20.0
             ),
             CommandDim(
                 "vx",
@@ -59,8 +59,8 @@ class G1(Morphology):
                 0.0,
                 3.0,
                 mobile_only=True,
-                sway=0.3,
-                sway_rate=0.2,
+                sway=0.15,
+                sway_rate=0.1,
                 max_accel=60.0,
             ),
             CommandDim(
@@ -72,8 +72,8 @@ class G1(Morphology):
                 0.0,
                 3.0,
                 mobile_only=True,
-                sway=0.2,
-                sway_rate=0.2,
+                sway=0.1,
+                sway_rate=0.1,
                 max_accel=60.0,
             ),
             CommandDim(

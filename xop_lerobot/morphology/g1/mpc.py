@@ -26,7 +26,7 @@ CONFIGS = {
         horizon=8,
         noise_std={"height": 0.03, "waist_yaw": 0.1, "waist_roll": 0.05, "waist_pitch": 0.1,
                    "vx": 0.06, "vy": 0.04},
-        weights=CostWeights(orientation=0.2),
+        weights=CostWeights(orientation=0.2, stance=0.05),
     ),
     Mode.MOBILE: MpcConfig(
         num_samples=12,
