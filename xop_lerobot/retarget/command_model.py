@@ -106,7 +106,7 @@ class CommandModel:
         """
         reach = self.space.compute_max_rate(mode, executed) * dt
         reached = np.clip(command - executed, -reach, reach)
-        ramp = np.abs(reached) / reach  # share of the time spent on the ramp
+        ramp = np.abs(reached) / np.maximum(reach, 1e-12)  # share of the time spent on the ramp
         mean = reached * (1 - ramp / 2)
         inside = np.abs(command - executed) <= reach
         drives = self._is_velocity & (mode is Mode.MOBILE)
