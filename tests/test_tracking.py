@@ -229,6 +229,15 @@ def test_arrival_lateness_and_what_comes_after():
     assert metrics["hand_cm"] == pytest.approx(1)
 
 
+def test_failed_and_vetoed_solves_are_counted():
+    track, trajectory = make_arrival(arrives=1.0)
+    flags = np.array([True, False, False, False])
+    changed = dataclasses.replace(trajectory, failed=flags, intervened=~flags)
+    metrics = compute_metrics(track, changed, TOLERANCE)
+    assert (metrics["failed_percent"], metrics["intervened_percent"]) == (25, 75)
+    assert compute_metrics(track, trajectory, TOLERANCE)["failed_percent"] == 0
+
+
 def test_what_never_arrives_is_infinitely_late():
     track, trajectory = make_arrival(arrives=2.0, offset=0.06)
     metrics = compute_metrics(track, trajectory, TOLERANCE)

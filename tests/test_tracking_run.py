@@ -137,7 +137,11 @@ def test_a_run_is_deterministic_and_measures_the_truth(short):
     assert not first.fallen.any()
 
 
-@pytest.mark.parametrize("name", ["default", "table1_equal", "no_proposal", "no_sync", "exact"])
+@pytest.mark.parametrize(
+    "name",
+    ["default", "table1_equal", "table1_hold", "no_extrapolation", "no_proposal", "no_candidates",
+     "no_preview", "no_sync", "exact"],
+)  # fmt: skip
 def test_the_loop_runs_what_the_ablation_says(short, name, monkeypatch):
     seen = {}
     drive = tracking._drive
@@ -155,6 +159,7 @@ def test_the_loop_runs_what_the_ablation_says(short, name, monkeypatch):
     assert seen["configs"] == resolve_configs(setup)
     assert seen["sync"] == (name != "no_sync") == record["sync"]
     assert seen["noise"] == ("off" if name == "exact" else "mild") == record["noise"]
+    assert record["metrics"]["failed_percent"] == 0  # a variant that cannot solve tells nothing
     assert record["samples"] == seen["configs"][Mode.STATIONARY].num_samples
     json.dumps(record, allow_nan=False)
 

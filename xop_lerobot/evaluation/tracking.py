@@ -43,6 +43,7 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.plan import Status
 from xop_lerobot.state import FRAMES
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 from xop_lerobot.transforms import (
@@ -239,6 +240,8 @@ def _drive(
         )
     }  # fmt: skip
     solves: list[float] = []
+    failed: list[bool] = []
+    intervened: list[bool] = []
     contacts: set[tuple[str, str]] = set()
     device = teleoperation.device
     assert isinstance(device, GoalDevice)
@@ -269,6 +272,8 @@ def _drive(
             plan_age = record.health.get("plan_age", np.inf)
             if plan_age == 0:
                 solves.append(record.health["solve_time"])
+                failed.append(record.health.get("status", 0.0) != Status.OK)
+                intervened.append(record.health.get("intervention", 0.0) > 0)
         if state.fallen:
             break
         loop.execute(action, dt)
@@ -277,6 +282,8 @@ def _drive(
         **{name: np.array(values) for name, values in rows.items()},
         solve_s=np.array(solves),
         contacts=tuple(sorted(contacts)),
+        failed=np.array(failed, dtype=bool),
+        intervened=np.array(intervened, dtype=bool),
     )
 
 

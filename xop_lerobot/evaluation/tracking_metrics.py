@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -38,6 +38,8 @@ class Trajectory:
         collision: Whether it touched anything in the tick. Shape (n,), bool.
         solve_s: Time of each solve [s]. Shape (m,).
         contacts: Pairs of bodies that were seen to touch.
+        failed: Whether each solve had no sample of finite cost. Shape (m,), bool.
+        intervened: Whether the retargeter slowed or vetoed each plan. Shape (m,), bool.
     """
 
     time: np.ndarray
@@ -51,6 +53,8 @@ class Trajectory:
     collision: np.ndarray
     solve_s: np.ndarray
     contacts: tuple[tuple[str, str], ...] = ()
+    failed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    intervened: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
         for name in ("head", "goal", "base", "command", "feet", "hands", "fallen", "collision"):
@@ -167,7 +171,8 @@ def compute_metrics(
         moves ``moving_*``: mean, worst and 95th percentile of the error. For all: ``foot_cm``,
         the largest travel of a foot; ``hand_cm``, the median distance of the hands;
         ``tilt_deg``, the largest tilt of the base; ``falls`` and ``collisions`` (0 or 1),
-        ``collided_goals``, and ``solve_ms`` and ``solve_p99_ms``.
+        ``collided_goals``, ``failed_percent`` and ``intervened_percent`` of the solves, and
+        ``solve_ms`` and ``solve_p99_ms``.
     """
     errors = compute_errors(trajectory, [step.start for step in track.steps])
     time = trajectory.time
@@ -205,4 +210,6 @@ def compute_metrics(
     if trajectory.solve_s.size:
         metrics["solve_ms"] = float(np.median(trajectory.solve_s)) * 1000
         metrics["solve_p99_ms"] = float(np.percentile(trajectory.solve_s, 99)) * 1000
+    for name, flags in (("failed", trajectory.failed), ("intervened", trajectory.intervened)):
+        metrics[f"{name}_percent"] = float(flags.mean()) * 100 if flags.size else 0.0
     return metrics

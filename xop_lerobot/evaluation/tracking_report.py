@@ -107,6 +107,8 @@ ABLATION_COLUMNS = {
     "mean [cm]": "moving_mean_cm",
     "worst [cm]": "moving_max_cm",
     "mean [°]": "moving_mean_deg",
+    "failed solves [%]": "failed_percent",
+    "vetoed [%]": "intervened_percent",
 }
 
 
@@ -259,5 +261,8 @@ def describe_run(key: str, run: Run) -> str:
         text = format_number(number) if isinstance(number, int | float) else str(number)
         cells.append(f"{heading} {text}")
     name = "/".join(key.split("/")[:-1])
+    for kind in ("failed", "intervened"):
+        if share := run["metrics"].get(f"{kind}_percent"):
+            cells.append(f"{kind.upper()} SOLVES {share:.0f} %")
     touched = f"; touched {', '.join(run['contacts'][:4])}" if run["contacts"] else ""
     return f"{name}: {', '.join(cells)}{touched} ({run['wall_s']:.0f} s)"
