@@ -60,6 +60,12 @@ ABLATIONS: dict[str, Ablation] = {
         preset="table1",
         equal_compute=True,
     ),
+    "table1_neutral": Ablation(
+        "the same, and energy counts from the neutral command",
+        {"kernel_mean": "hold", "control_reference": "neutral"},
+        preset="table1",
+        equal_compute=True,
+    ),
     "no_extrapolation": Ablation("no extrapolated terminal state", {"extrapolation_s": 0.0}),
     "no_hold_kernel": Ablation("kernel of zero mean", {"kernel_mean": "zero"}),
     "no_time_shift": Ablation("one control step of shift", {"shift": "one"}),
