@@ -32,7 +32,7 @@ from xop_lerobot.dataset.record import build_features
 from xop_lerobot.dataset.shutdown import hold_signals
 from xop_lerobot.dataset.video_queue import VideoQueue
 from xop_lerobot.dataset.xop_dataset import DatasetExists, WrongFps, XopDataset
-from xop_lerobot.errors import LinkError, XopError
+from xop_lerobot.errors import BadValue, LinkError, XopError
 from xop_lerobot.link import Outcome, TickRecord, get_session
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.state import FRAMES, Goal
@@ -562,3 +562,116 @@ def test_a_killed_session_keeps_its_episodes(tmp_path, command, number):
     assert len(loaded) == 10 * loaded.num_episodes
     for index in (0, 10, len(loaded) - 1):
         assert loaded[index]["observation.images.head"].shape == (3, 48, 64)
+
+
+# Settings and changes.
+
+
+def test_changes_are_recorded_with_their_frame(session, tmp_path):
+    robot, teleop = make_toy(session), make_teleop(session, retargeter="mpc")
+    teleop.connect()
+    robot.connect()
+    dataset = create(session, robot, tmp_path / "data")
+    for frame in range(8):
+        if frame == 3:
+            teleop.change({"preset": "conservative", "weights": {"position": 2.0}}, "control")
+        if frame == 5:
+            teleop.toggle("upright", "key")
+            teleop.change({"mode": "mobile"})
+        tick(robot, teleop, dataset)
+    dataset.save_episode()
+    tick(robot, teleop, dataset)
+    tick(robot, teleop, dataset)
+    dataset.save_episode()
+    dataset.finalize()
+    teleop.disconnect()
+    robot.disconnect()
+
+    first, second = read_facts(dataset.root)
+    times = stack(read_rows(dataset.root), "time.sim")[:, 0]
+    expected = [
+        (3, "control", {"preset": "conservative", "weights": {"position": 2.0}}),
+        (5, "key", {"constraints": {"upright": True}}),
+        (5, "call", {"mode": "mobile"}),
+    ]
+    for change, (frame, source, what) in zip(first["changes"], expected, strict=True):
+        assert change == {
+            "frame": frame, "time": times[frame], "source": source, "change": what,
+        }  # fmt: skip
+    assert (first["settings"]["preset"], first["settings"]["mode"]) == ("default", "stationary")
+    assert second["changes"] == []
+    # What was changed stays in force; the mode is that of the operator's start.
+    assert second["settings"] == {
+        "preset": "conservative", "weights": {"position": 2.0}, "variant": "v1",
+        "targets": ["head"], "body": [], "constraints": ["upright"], "mode": "stationary",
+    }  # fmt: skip
+    episodes = LeRobotDataset("local/toy", root=dataset.root).meta.episodes
+    assert json.loads(episodes[0]["xop/changes"]) == first["changes"]
+    assert json.loads(episodes[1]["xop/settings"]) == second["settings"]
+
+
+def test_a_discarded_episode_takes_its_changes_along(session, pair, tmp_path):
+    robot, teleop = pair
+    dataset = create(session, robot, tmp_path / "data")
+    tick(robot, teleop, dataset)
+    teleop.change({"mode": "mobile"})
+    tick(robot, teleop, dataset)
+    dataset.clear_episode_buffer()
+    tick(robot, teleop, dataset)
+    dataset.save_episode()
+    dataset.finalize()
+    (facts,) = read_facts(dataset.root)
+    assert facts["changes"] == []
+
+
+def test_columns_of_another_version_are_not_mixed(session, pair, tmp_path, monkeypatch):
+    robot, teleop = pair
+    root = tmp_path / "data"
+    with monkeypatch.context() as patch:
+        patch.setattr("xop_lerobot.dataset.columns.HEALTH_NAMES", ("solve_time", "plan_age"))
+        dataset = create(session, robot, root)
+        tick(robot, teleop, dataset)
+        dataset.save_episode()
+        dataset.finalize()
+    with pytest.raises(BadValue) as refusal:
+        XopDataset.bind(session).resume("local/toy", root=root)
+    assert str(refusal.value) == (
+        f"'{root}' was recorded by another version: its column 'retargeter.health' has the "
+        f"entries solve_time, plan_age, and not {', '.join(HEALTH_NAMES)}. Begin a new dataset"
+    )
+
+
+def test_hardware_has_the_estimate_where_a_simulation_has_the_truth(session, pair):
+    robot, _ = pair
+    robot.get_observation()
+    state, info = get_session(session).state, get_session(session).robot
+    estimate = np.array(state.qpos) + 0.01
+    record = make_tick(state, estimate=estimate)
+    simulated = Columns(info).build_row(state, record, None)
+    real = Columns(dataclasses.replace(info, has_truth=False)).build_row(state, record, None)
+    np.testing.assert_allclose(simulated["robot.base_pose"], state.true_qpos[:7], atol=1e-6)
+    np.testing.assert_allclose(real["robot.base_pose"], estimate[:7], atol=1e-6)
+    assert real["robot.head"][0] == pytest.approx(simulated["robot.head"][0] + 0.01, abs=0.02)
+
+
+def test_health_of_a_tick_is_in_its_columns(session, tmp_path):
+    robot, teleop = make_toy(session), make_teleop(session, retargeter="mpc")
+    teleop.connect()
+    robot.connect()
+    dataset = create(session, robot, tmp_path / "data")
+    for _ in range(4):
+        tick(robot, teleop, dataset)
+    dataset.save_episode()
+    dataset.finalize()
+    health = stack(read_rows(dataset.root), "retargeter.health")
+    columns = dict(zip(HEALTH_NAMES, health.T, strict=True))
+    assert (columns["solve_time"] > 0).all()
+    assert (columns["plan_age"] == 0).all()  # lock-step
+    assert (columns["effective_samples"] >= 1).all()
+    assert set(columns["status"]) <= {0, 1}
+    assert set(columns["sync_status"]) <= {0, 1, 2, 3}
+    assert (columns["sync_residual"] >= 0).all()
+    assert (columns["risk"] >= 0).all()
+    assert (columns["risk"] <= 1).all()
+    teleop.disconnect()
+    robot.disconnect()

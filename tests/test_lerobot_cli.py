@@ -6,8 +6,11 @@ The commands run in this process, as importing LeRobot's scripts takes ten secon
 from __future__ import annotations
 
 import importlib
+import json
 import signal
 import sys
+import threading
+import time
 from pathlib import Path
 
 import draccus
@@ -18,8 +21,11 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.scripts.lerobot_record import RecordConfig
 
 from xop_lerobot.command import Mode
+from xop_lerobot.control.client import ControlClient
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.dataset.record import XopRecordConfig
+from xop_lerobot.errors import XopError
+from xop_lerobot.link import get_session
 
 REPO = Path(__file__).parents[1]
 ROBOT = ("--robot.type=xop_toy", "--robot.width=64", "--robot.height=48")
@@ -231,3 +237,55 @@ def test_configs_that_are_shipped(robot, config_class):
     assert config.robot.fps == config.dataset.fps
     assert config.dataset.rgb_encoder.vcodec == "h264"
     assert config.teleop.device.start_mode is Mode.STATIONARY
+
+
+# Changed while it records.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["lerobot-record", "xop-record"])
+def test_settings_change_while_it_records(tmp_path, monkeypatch, command):
+    """Through the control socket, as another terminal does it, and into the episode."""
+    root, path = tmp_path / "data", tmp_path / "xop.sock"
+    answers: list[dict] = []
+
+    def ask() -> None:
+        """Change the preset as soon as some frames are recorded."""
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and len(answers) < 2:
+            if get_session().tick is None:
+                time.sleep(0.01)
+                continue
+            try:
+                with ControlClient(path) as client:
+                    time.sleep(0.2)
+                    answers.append(client.request({"preset": "conservative"}))
+                    answers.append(client.request({"weights": {"position": 3}}))
+            except XopError:
+                time.sleep(0.05)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    teleop = [flag for flag in TELEOP if "retargeter" not in flag]
+    flags = [*ROBOT, *teleop, *record_flags(root, num_episodes=1, episode_time_s=12)]
+    flags += [f"--teleop.control={path}", "--teleop.keys=true", "--play_sounds=false"]
+    flags += ["--teleop.retargeter.threads=1"]
+    run(monkeypatch, command, *flags)
+    thread.join()
+    assert not path.exists()
+    assert answers[-1]["weights"] == {"position": 3}
+    (facts,) = read_facts(root)
+    assert facts["settings"]["preset"] == "default"
+    changes = [each for each in facts["changes"] if each["source"] == "control"]
+    assert [each["change"] for each in changes] == [
+        {"preset": "conservative"}, {"weights": {"position": 3}},
+    ]  # fmt: skip
+    # The script walks for a while.
+    modes = [each["change"]["mode"] for each in facts["changes"] if each["source"] == "device"]
+    assert modes == ["mobile", "stationary"]
+    assert 0 < changes[0]["frame"] <= changes[1]["frame"] < facts["length"]
+    dataset = LeRobotDataset("local/toy", root=root)
+    stored = json.loads(dataset.meta.episodes[0]["xop/changes"])
+    assert stored == facts["changes"]
+    times = np.ravel(dataset.hf_dataset["time.sim"])
+    assert times[changes[0]["frame"]] == changes[0]["time"]

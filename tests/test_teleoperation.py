@@ -368,7 +368,7 @@ def test_the_robot_follows_head_and_hands(rig, name):
         return dataclasses.replace(frame, left_wrist=wrist)
 
     r.person.motion = motion
-    ticks = r.run(3.0)
+    ticks = r.run(4.5)
     goal = ticks[-1][1].goal
     now = r.frames
     assert goal.poses["head"][2] == pytest.approx(frames["head"][2] - 0.06, abs=1e-3)
