@@ -280,8 +280,8 @@ def test_settings_change_while_it_records(tmp_path, monkeypatch, command):
     assert [each["change"] for each in changes] == [
         {"preset": "conservative"}, {"weights": {"position": 3}},
     ]  # fmt: skip
-    # The script walks for a while.
-    modes = [each["change"]["mode"] for each in facts["changes"] if each["source"] == "device"]
+    # The person in the script pinches twice to walk, and twice to stand.
+    modes = [each["change"]["mode"] for each in facts["changes"] if each["source"] == "gesture"]
     assert modes == ["mobile", "stationary"]
     assert 0 < changes[0]["frame"] <= changes[1]["frame"] < facts["length"]
     dataset = LeRobotDataset("local/toy", root=root)
