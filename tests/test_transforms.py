@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from xop_lerobot.transforms import (
     IDENTITY_POSE,
+    compute_heading_squares,
     heading_error,
     make_pose,
     pose_inverse,
@@ -239,3 +240,13 @@ def test_wrap_angle_keeps_the_direction_and_the_range(angle, turns):
 @pytest.mark.parametrize("angle, wrapped", [(np.pi, np.pi), (-np.pi, np.pi), (0.0, 0.0)])
 def test_wrap_angle_closes_at_plus_pi(angle, wrapped):
     assert wrap_angle(angle) == wrapped
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_squares_of_heading_errors_equal_those_of_the_vector(seed):
+    rng = np.random.default_rng(seed)
+    goal, quat = quat_exp(2 * rng.normal(size=(2, 5, 3)))
+    error = np.square(heading_error(goal, quat))
+    turn, tilt = compute_heading_squares(goal, quat)
+    np.testing.assert_allclose(turn, error[..., 2], atol=1e-9)
+    np.testing.assert_allclose(tilt, error[..., :2].sum(-1), atol=1e-9)

@@ -136,13 +136,21 @@ class CommandSpace:
         """How far `mobile_only` entries may leave neutral in stationary mode. Shape (k,)."""
         return self._column("sway")
 
+    @cached_property
+    def _sways(self) -> np.ndarray:
+        return self.sway > 0
+
+    @cached_property
+    def _sway_rate(self) -> np.ndarray:
+        return self._column("sway_rate")
+
     def compute_max_rate(self, mode: Mode, executed: np.ndarray) -> np.ndarray:
         """Rate limits per second after `executed`. Shapes (k,) -> (k,)."""
-        if mode is Mode.MOBILE:
+        if mode is Mode.MOBILE or not self._sways.any():
             return self.max_rate
         # What is still faster than any sway is being stopped, which is done at the full rate.
         sways = self.mobile_only & (np.abs(executed - self.neutral) <= self.sway + 1e-6)
-        return np.where(sways & (self.sway > 0), self._column("sway_rate"), self.max_rate)
+        return np.where(sways & self._sways, self._sway_rate, self.max_rate)
 
     def restrict(self, command: np.ndarray, mode: Mode) -> np.ndarray:
         """What of a command `mode` and the bounds allow. Shapes (..., k)."""

@@ -10,10 +10,8 @@ import numpy as np
 from xop_lerobot.command import CommandSpace, Mode
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.transforms import (
-    quat_conjugate,
     quat_from_yaw,
     quat_multiply,
-    quat_rotate,
     quat_yaw,
 )
 
@@ -34,9 +32,6 @@ class CommandModel:
         space: Its command space, or its decision space.
         effects: One effect for each entry.
         pivot: Forward distance from the base's frame to its centre of turning [m].
-
-    Attributes:
-        body: Which entries are free to act; all at first. Shape (k,), bool.
     """
 
     def __init__(
@@ -47,7 +42,7 @@ class CommandModel:
         pivot: float = 0.0,
     ) -> None:
         self.space, self.effects, self.pivot = space, effects, pivot
-        self.body = np.ones(len(space), dtype=bool)
+        self._shares: dict[float, np.ndarray] = {}
         self._nv = model.nv
         self._twist = [
             (i, _TWIST.index(effect.acts))
@@ -66,10 +61,35 @@ class CommandModel:
             for mode in Mode
         }
         self._sway = np.array([effect.sway_s for effect in effects])
+        self.body = np.ones(len(space), dtype=bool)
+
+    @property
+    def body(self) -> np.ndarray:
+        """Which entries are free to act; all at first. Shape (k,), bool."""
+        return self._body
+
+    @body.setter
+    def body(self, mask: np.ndarray) -> None:
+        self._body = np.array(mask, dtype=bool)
+        self._body.setflags(write=False)
+        self._acting = {mode: acts & self._body for mode, acts in self._modes.items()}
+        self._following = {
+            mode: np.flatnonzero(acting & self._follows) for mode, acting in self._acting.items()
+        }
+        self._moves_base = {
+            mode: bool((acting & self._is_velocity).any()) for mode, acting in self._acting.items()
+        }
 
     def acting(self, mode: Mode) -> np.ndarray:
         """Which free entries have an effect in `mode`. Shape (k,), bool."""
-        return self._modes[mode] & self.body
+        return self._acting[mode]
+
+    def _compute_share(self, dt: float) -> np.ndarray:
+        """Share of a change that height and joints have made after `dt`. Shape (k,)."""
+        share = self._shares.get(dt)
+        if share is None:
+            share = self._shares[dt] = 1 - np.exp(-dt / self._lag)
+        return share
 
     @property
     def is_nonholonomic(self) -> bool:
@@ -141,16 +161,17 @@ class CommandModel:
         Returns:
             Configurations then. Shape (..., nq).
         """
-        shape = np.broadcast_shapes(qpos.shape[:-1], command.shape[:-1])
+        shape = command.shape[:-1]
+        if qpos.ndim > 1:
+            shape = np.broadcast_shapes(qpos.shape[:-1], shape)
         if executed is not None:
             command, _ = self._ramp(command, executed, dt, mode)
         result = np.broadcast_to(qpos, (*shape, qpos.shape[-1])).copy()
-        acting = self.acting(mode)
-        index = np.flatnonzero(acting & self._follows)
-        share, address = 1 - np.exp(-dt / self._lag[index]), self._address[index]
+        index = self._following[mode]
+        share, address = self._compute_share(dt)[index], self._address[index]
         target = command[..., index] if offset is None else command[..., index] + offset[index]
         result[..., address] += share * (target - result[..., address])
-        if not (acting & self._is_velocity).any():
+        if not self._moves_base[mode]:
             return result
         if mode is Mode.STATIONARY:
             self._sway_base(result, command, settled, dt)
@@ -173,13 +194,13 @@ class CommandModel:
     ) -> None:
         """Shift the base over standing feet, in place."""
         settled = self.space.neutral if settled is None else settled
-        shift = self.compute_twist(self._sway * (1 - np.exp(-dt / self._lag)) * (command - settled))
+        shift = self.compute_twist(self._sway * self._compute_share(dt) * (command - settled))
         yaw = quat_yaw(qpos[..., 3:7])
         x, y = np.cos(yaw), np.sin(yaw)
         qpos[..., 0] += shift[..., 0] * x - shift[..., 1] * y
         qpos[..., 1] += shift[..., 0] * y + shift[..., 1] * x
 
-    def compute_jacobian(
+    def linearise(
         self,
         qpos: np.ndarray,
         command: np.ndarray,
@@ -187,47 +208,87 @@ class CommandModel:
         mode: Mode,
         drift: np.ndarray | None = None,
         executed: np.ndarray | None = None,
-    ) -> np.ndarray:
-        r"""Compute :math:`\partial\phi_\tau(q, a)/\partial a`, in MuJoCo's tangent space.
+        offset: np.ndarray | None = None,
+        settled: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        r"""Compute one extrapolation and :math:`\partial\phi_\tau(q, a)/\partial a`.
 
-        Linear velocity of the base in the world, its angular velocity in the body at the
-        extrapolated configuration. Arguments as for `extrapolate`, without leading dimensions.
+        Arguments as for `extrapolate`, without leading dimensions; plain numbers instead of
+        arrays make it fast. The derivative is in MuJoCo's tangent space: linear velocity of the
+        base in the world, its angular velocity in the body.
 
         Returns:
-            Derivative. Shape (nv, k); zero for entries that do not act.
+            Configuration then, shape (nq,), and its derivative, shape (nv, k), zero for entries
+            that do not act.
         """
         slope = np.ones(len(command))
         if executed is not None:
             command, slope = self._ramp(command, executed, dt, mode)
-        acting = self.acting(mode)
-        jacobian = np.zeros((self._nv, len(command)))
-        index = np.flatnonzero(acting & self._follows)
-        jacobian[self._dof[index], index] = (1 - np.exp(-dt / self._lag[index])) * slope[index]
-        if not (acting & self._is_velocity).any():
-            return jacobian
-        yaw = float(quat_yaw(qpos[3:7]))
-        if mode is Mode.STATIONARY:
-            gain = self._sway * (1 - np.exp(-dt / self._lag)) * slope
-            x, y = math.cos(yaw), math.sin(yaw)
-            for i, acts in self._twist:
-                if acting[i] and acts != _TURN:
-                    jacobian[:2, i] = gain[i] * np.array(((x, y), (-y, x))[acts])
-            return jacobian
-        twist = self.compute_twist(command) + (0 if drift is None else drift)
+        index, share = self._following[mode], self._compute_share(dt)
+        future, jacobian = np.array(qpos), np.zeros((self._nv, len(command)))
+        address, gain = self._address[index], share[index]
+        target = command[index] if offset is None else command[index] + offset[index]
+        future[address] += gain * (target - future[address])
+        jacobian[self._dof[index], index] = gain * slope[index]
+        if self._moves_base[mode]:
+            w, x, y, z = (float(value) for value in qpos[3:7])
+            yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+            if mode is Mode.STATIONARY:
+                settled = self.space.neutral if settled is None else settled
+                self._linearise_sway(future, jacobian, command - settled, slope, share, yaw)
+            else:
+                twist = self.compute_twist(command) + (0 if drift is None else drift)
+                self._linearise_drive(future, jacobian, twist, slope, yaw, dt)
+        return future, jacobian
+
+    def _linearise_sway(
+        self,
+        future: np.ndarray,
+        jacobian: np.ndarray,
+        change: np.ndarray,
+        slope: np.ndarray,
+        share: np.ndarray,
+        yaw: float,
+    ) -> None:
+        """Shift the base over standing feet; see `_sway_base`."""
+        axes = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+        gain = self._sway * share
+        for i, acts in self._twist:
+            if self._acting[Mode.STATIONARY][i] and acts != _TURN:
+                jacobian[:2, i] = gain[i] * slope[i] * axes[acts]
+        shift = self.compute_twist(gain * change)
+        future[:2] += shift[0] * axes[0] + shift[1] * axes[1]
+
+    def _linearise_drive(
+        self,
+        future: np.ndarray,
+        jacobian: np.ndarray,
+        twist: np.ndarray,
+        slope: np.ndarray,
+        yaw: float,
+        dt: float,
+    ) -> None:
+        """Drive the base along the chord of its arc; see `extrapolate`."""
         forward, left, turn = (float(value) for value in twist)
         middle, end = yaw + turn * dt / 2, yaw + turn * dt
-        x, y = math.cos(middle), math.sin(middle)
+        cosine, sine = math.cos(middle), math.sin(middle)
         across = dt * dt / 2
         turning = (
-            -across * (forward * y + left * x) + self.pivot * dt * math.sin(end),
-            across * (forward * x - left * y) - self.pivot * dt * math.cos(end),
+            -across * (forward * sine + left * cosine) + self.pivot * dt * math.sin(end),
+            across * (forward * cosine - left * sine) - self.pivot * dt * math.cos(end),
         )
-        columns = ((dt * x, dt * y), (-dt * y, dt * x), turning)
+        columns = ((dt * cosine, dt * sine), (-dt * sine, dt * cosine), turning)
+        w, x, y, z = (float(value) for value in future[3:7])
         # A turn about the vertical, seen from the body: R^T e_z, which the turn leaves alone.
-        axis = dt * quat_rotate(quat_conjugate(qpos[3:7]), np.array([0.0, 0, 1]))
+        axis = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         for i, acts in self._twist:
-            if acting[i]:
+            if self._acting[Mode.MOBILE][i]:
                 jacobian[:2, i] = np.multiply(columns[acts], slope[i])
                 if acts == _TURN:
-                    jacobian[3:6, i] = axis * slope[i]
-        return jacobian
+                    jacobian[3:6, i] = np.multiply(axis, slope[i] * dt)
+        future[0] += dt * (forward * cosine - left * sine)
+        future[1] += dt * (forward * sine + left * cosine)
+        future[0] += self.pivot * (math.cos(yaw) - math.cos(end))
+        future[1] += self.pivot * (math.sin(yaw) - math.sin(end))
+        c, n = math.cos(turn * dt / 2), math.sin(turn * dt / 2)
+        future[3:7] = c * w - n * z, c * x - n * y, c * y + n * x, c * z + n * w

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from threading import RLock
@@ -253,7 +254,7 @@ class MpcRetargeter(Retargeter):
             mode=mode,
             qpos=prediction.qpos[best],
             arms={names[i]: planned[:, i] for i in np.flatnonzero(acting) if i >= count},
-            cost={name: float(np.nan_to_num(term[best])) for name, term in terms.items()},
+            cost={name: _finite(term[best]) for name, term in terms.items()},
             health={"intervention": float(verdict.intervention), "risk": verdict.risk},
             status=Status.OK if np.isfinite(costs).any() else Status.DIVERGED,
             effective_samples=compute_effective_samples(weights),
@@ -477,6 +478,10 @@ class MpcRetargeter(Retargeter):
             slowed = np.where(self.command_model.is_velocity(), verdict.scale * base, base)
             planner.reset(slowed)
         return planner.commands
+
+
+def _finite(value: float) -> float:
+    return float(value) if math.isfinite(value) else 0.0
 
 
 def _override(config: MpcConfig, settings: RetargeterConfig) -> MpcConfig:

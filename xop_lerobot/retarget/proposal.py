@@ -20,7 +20,7 @@ from xop_lerobot.retarget.linearisation import Linearisation, find_site
 from xop_lerobot.transforms import quat_rotate, quat_yaw
 
 _DAMPING = 1e-3  # of the first step, in shares of a command's scale
-_CONVERGED = 1e-4  # a step that small ends the iteration, in shares of a command's scale
+_CONVERGED = 1e-3  # a step that small ends the iteration, in shares of a command's scale
 _DAQP_OPTIMAL = 1
 
 
@@ -102,6 +102,8 @@ class KinematicProposal:
     ) -> None:
         self.command_model, self.sites = command_model, dict(sites)
         self.weights = weights or ProposalWeights()
+        self._position = np.array(self.weights.position)
+        self._orientation = np.array(self.weights.orientation)
         self.support, self.iterations = support, iterations
         self._linearisation = Linearisation(model)
         self._site_ids = {name: find_site(model, site) for name, site in self.sites.items()}
@@ -219,17 +221,16 @@ class KinematicProposal:
             Residuals, shape (m,), and their Jacobian, shape (m, k).
         """
         model, weights = self.command_model, self.weights
-        future = model.extrapolate(qpos, command, dt, mode, drift, executed, offset, settled)
-        motion = model.compute_jacobian(qpos, command, dt, mode, drift, executed)
+        future, motion = model.linearise(qpos, command, dt, mode, drift, executed, offset, settled)
         self._linearisation.update(future)
         residuals, jacobians = [], []
         for name, goal in goals.items():
             position, quat, linear, angular = self._linearisation.compute_site(self._site_ids[name])
-            gain = np.array(weights.position)
+            gain = self._position
             residuals.append((position - goal[:3]) * gain)
             jacobians.append(gain[:, None] * (linear @ motion))
             error, by_rotation = linearise_heading(goal[3:], quat)
-            gain = np.array(weights.orientation)
+            gain = self._orientation
             residuals.append(-error * gain)
             jacobians.append(gain[:, None] * (by_rotation @ (angular @ motion)))
         if self.support is not None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import heading_error
+from xop_lerobot.transforms import compute_heading_squares
 
 
 class TrackingCost(Cost):
@@ -36,6 +36,5 @@ def compute_tracking(poses: np.ndarray, goals: np.ndarray, weights: CostWeights)
     and for small errors, the paper's :math:`d(\theta, \theta^d)^2`.
     """
     position = np.square(poses[..., :3] - goals[..., :3]).sum(-1)
-    error = np.square(heading_error(goals[..., 3:], poses[..., 3:]))
-    turn = error[..., 2] + weights.tilt_share * (error[..., 0] + error[..., 1])
-    return weights.position * position + weights.orientation * turn
+    turn, tilt = compute_heading_squares(goals[..., 3:], poses[..., 3:])
+    return weights.position * position + weights.orientation * (turn + weights.tilt_share * tilt)
