@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -91,7 +92,7 @@ class CommandModel:
             share = self._shares[dt] = 1 - np.exp(-dt / self._lag)
         return share
 
-    @property
+    @cached_property
     def is_nonholonomic(self) -> bool:
         """Whether the base drives forward but not sideways."""
         acts = {effect.acts for effect in self.effects}

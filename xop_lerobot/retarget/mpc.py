@@ -33,7 +33,6 @@ from xop_lerobot.retarget.readings import Readings
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
 from xop_lerobot.retarget.weighting import compute_effective_samples
 from xop_lerobot.state import Goal, RobotState
-from xop_lerobot.transforms import rotation_error
 
 _SLOW = 0.3  # speed up to which a base on wheels need not face where it goes [m/s]
 
@@ -293,6 +292,8 @@ class MpcRetargeter(Retargeter):
 
         At rest the base need not face the last centimetres: they are turned into, not driven.
         """
+        if not self.command_model.is_nonholonomic:
+            return np.zeros(2)
         for name, poses_then in self._preview(goal, config.proposal_s, config).items():
             velocity = (poses_then[0, :2] - poses[name][:2]) / config.proposal_s
             speed = float(np.linalg.norm(velocity))
@@ -372,8 +373,8 @@ class MpcRetargeter(Retargeter):
         error = 0.0
         ahead = config.horizon * POLICY_DT
         for name, goals in self._preview(goal, ahead, config).items():
-            turn = np.linalg.norm(rotation_error(goals[0, 3:], poses[name][3:]))
-            error = max(error, np.linalg.norm(poses[name][:3] - goals[0, :3]), 0.5 * turn)
+            cosine = min(abs(float(goals[0, 3:] @ poses[name][3:])), 1.0)  # of half the angle
+            error = max(error, math.dist(poses[name][:3], goals[0, :3]), math.acos(cosine))
         return float(np.clip(error / config.full_noise_error, config.min_noise, 1.0))
 
     def _limit_rates(self, executed: np.ndarray, commands: np.ndarray, mode: Mode) -> np.ndarray:
