@@ -55,7 +55,7 @@ def _make_conservative(
     stay near the plan.
     """
     del morphology, paper
-    weights = dataclasses.replace(config.weights, change=0.2)
+    weights = dataclasses.replace(config.weights, control=0.5, change=0.2)
     return _hurry(dataclasses.replace(config, weights=weights), time=2.0, noise=0.5)
 
 
@@ -64,7 +64,7 @@ def _make_aggressive(
 ) -> MpcConfig:
     """Faster and rougher: the part of the paper's w_a = 0.02."""
     del morphology, paper
-    weights = dataclasses.replace(config.weights, change=0.0)
+    weights = dataclasses.replace(config.weights, control=0.02, change=0.0)
     hurried = _hurry(dataclasses.replace(config, weights=weights), time=0.7, noise=1.5)
     return dataclasses.replace(hurried, full_noise_error=0.5 * config.full_noise_error)
 

@@ -61,7 +61,7 @@ class G1(Morphology):
                 mobile_only=True,
                 sway=0.15,
                 sway_rate=0.1,
-                max_accel=60.0,
+                max_accel=100.0,
             ),
             CommandDim(
                 "vy",
@@ -74,7 +74,7 @@ class G1(Morphology):
                 mobile_only=True,
                 sway=0.1,
                 sway_rate=0.1,
-                max_accel=60.0,
+                max_accel=100.0,
             ),
             CommandDim(
                 "yaw_rate",

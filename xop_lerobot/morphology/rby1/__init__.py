@@ -62,7 +62,7 @@ class RBY1(Morphology):
     command_space = CommandSpace(
         (
             # name, key, unit, low, high, neutral, largest rate and change of rate
-            CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.5, mobile_only=True, max_accel=30.0),
+            CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.5, mobile_only=True, max_accel=50.0),
             CommandDim(
                 "yaw_rate",
                 "theta.vel",
@@ -72,7 +72,7 @@ class RBY1(Morphology):
                 0.0,
                 3.0,
                 mobile_only=True,
-                max_accel=60.0,
+                max_accel=100.0,
             ),
             *_make_torso_dims(),
         )
