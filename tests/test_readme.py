@@ -76,11 +76,27 @@ def parse(command: list[str], monkeypatch: pytest.MonkeyPatch) -> object:
     return draccus.parse(find_config_class(name), config_path=next(iter(paths), None), args=flags)
 
 
+def check_control(flags: list[str]) -> None:
+    """Check that the flags of `xop-control` make a change that RB-Y1 takes."""
+    from xop_lerobot.control.client import build_request, make_parser
+    from xop_lerobot.morphology.morphology import make_morphology
+    from xop_lerobot.retarget.changes import apply_change, make_settings, parse_change
+    from xop_lerobot.retarget.config import RetargeterConfig
+
+    request = build_request(make_parser().parse_args(flags))
+    if not {"toggle", "get"} & set(request):
+        robot = make_morphology("rby1")
+        apply_change(robot, make_settings(robot, RetargeterConfig()), parse_change(request))
+
+
 @pytest.mark.parametrize(("page", "command"), ALL_COMMANDS)
 def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     if command[0] == "make":
         verbs = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M)
         assert command[1] in verbs, f"{page.name} tells of 'make {command[1]}'"
+        return
+    if command[0] == "xop-control":
+        check_control(command[1:])
         return
     config = parse(command, monkeypatch)
     dataset = getattr(config, "dataset", None)

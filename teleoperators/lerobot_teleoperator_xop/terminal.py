@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable
+from typing import Any
 
 from lerobot.utils.keyboard_input import (
     TerminalKeyListener,
@@ -44,7 +45,7 @@ def listen_to_terminal(target: Target) -> TerminalKeyListener | None:
     return listener
 
 
-def listen_while_recording(target: Target) -> tuple[object | None, dict[str, bool]]:
+def listen_while_recording(target: Target) -> tuple[Any, dict[str, bool]]:
     """Read LeRobot's keys of a recording and those of the settings with one listener.
 
     Returns:

@@ -10,6 +10,7 @@ from enum import IntEnum
 import numpy as np
 
 from xop_lerobot.command import Mode
+from xop_lerobot.retarget.config import MpcConfig
 from xop_lerobot.state import Goal, RobotState
 
 
@@ -73,6 +74,16 @@ class Retargeter(ABC):
     @abstractmethod
     def control_period(self, mode: Mode) -> float:
         """Time between two plans in `mode` [s]."""
+
+    def configure(
+        self,
+        configs: Mapping[Mode, MpcConfig] | None = None,
+        targets: tuple[str, ...] | None = None,
+        body: tuple[str, ...] | None = None,
+        constraints: frozenset[str] | None = None,
+    ) -> None:
+        """Change settings from the next solve on; nothing for a retargeter that has none."""
+        del configs, targets, body, constraints
 
     def close(self) -> None:
         """Release threads; may be called twice."""
