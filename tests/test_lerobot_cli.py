@@ -205,6 +205,12 @@ BAD_FLAGS = {
     "--robot.width=0": "a picture must be at least 1 x 1 pixels, got 0 x 48",
     "--teleop.device.hold_s=-1": "device.hold_s must be finite and at least 0, got -1.0",
     "--teleop.device.mode=fly": "unknown device.mode 'fly'. Known: mobile, stationary",
+    "--teleop.retargeter.preset=fast": (
+        "unknown preset 'fast'. Known: aggressive, conservative, default, table1"
+    ),
+    "--teleop.gestures.both_double_pinch=wave": (
+        "unknown gestures.both_double_pinch 'wave'. Known: aggressive, conservative, default, none"
+    ),
     "--teleop.retargeter.type=magic": "unknown retargeter 'magic'. Known: direct, mpc",
     "--teleop.alignment.walk_scale=0": "alignment.walk_scale must be finite and above 0, got 0.0",
 }

@@ -11,6 +11,7 @@ import numpy as np
 
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS
 
 HANDS = ("left", "right")
 GRIP_OPEN = 0.06
@@ -205,11 +206,15 @@ class GestureConfig:
     window: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check the window.
+        """Check both values.
 
         Raises:
-            BadValue: If it is not positive.
+            UnknownName: If there is nothing of that name to toggle.
+            BadValue: If the window is not positive.
         """
+        known = ("none", *CONSTRAINTS, *PRESETS)
+        if self.both_double_pinch not in known:
+            raise UnknownName("gestures.both_double_pinch", self.both_double_pinch, known)
         if not (math.isfinite(self.window) and self.window > 0):
             raise BadValue(f"gestures.window must be finite and above 0, got {self.window}")
 
