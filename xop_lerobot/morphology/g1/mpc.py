@@ -35,7 +35,7 @@ CONFIGS = {
             "waist_roll": 0.03, "waist_pitch": 0.05, "vx": 0.25, "vy": 0.2, "yaw_rate": 0.3,
         },
         # A walking robot that leans as its operator does pays with its balance.
-        weights=CostWeights(orientation=0.03, tilt_share=0.3),
+        weights=CostWeights(orientation=0.1, tilt_share=0.5),
     ),
 }  # fmt: skip
 
