@@ -24,6 +24,7 @@ from xop_lerobot.retarget.costs import (
     TrackingCost,
     UprightCost,
 )
+from xop_lerobot.retarget.costs.lateral import compute_facing
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.transforms import (
     heading_error,
@@ -69,7 +70,7 @@ def make_evaluation(seed: int = 0, **fields) -> Evaluation:
         "goals": {name: draw_poses(rng, H + 1) for name in ("head", "left_wrist")},
         "terminal_poses": {name: draw_poses(rng, K) for name in ("head", "left_wrist")},
         "terminal_goals": {name: draw_poses(rng) for name in ("head", "left_wrist")},
-        "wanted_velocity": np.array([0.3, -0.2]),
+        "facing": np.array([0.3, -0.2]),
         "mode": Mode.STATIONARY,
         "dt": DT,
         "weights": WEIGHTS,
@@ -418,19 +419,48 @@ def test_costs_are_finite_positive_and_proportional_to_their_weight(cost):
     np.testing.assert_array_equal(cost.compute(make_evaluation(weights=nothing)), np.zeros(K))
 
 
-def test_lateral_is_the_part_of_the_velocity_across_the_heading():
-    """A base that faces 90° to the left of where it has to go, at 0.5 m/s, pays all of it."""
+@pytest.mark.parametrize("share", [1.0, 0.4])
+def test_lateral_is_the_angle_to_where_the_base_shall_face(share):
+    turned = np.tile(base_at(1, 2, np.pi / 2), (K, 1))
     e = make_evaluation(
-        terminal_qpos=np.concatenate(
-            [np.tile(base_at(1, 2, np.pi / 2), (K, 1)), np.zeros((K, NQ - 7))], 1
-        ),
-        wanted_velocity=np.array([0.5, 0.0]),
+        terminal_qpos=np.concatenate([turned, np.zeros((K, NQ - 7))], 1),
+        facing=share * np.array([math.cos(0.3), math.sin(0.3)]),
         weights=CostWeights(lateral=2.0),
     )
-    np.testing.assert_allclose(LateralCost(nonholonomic=True).compute(e), 2.0 * 0.5**2)
-    along = dataclasses.replace(e, wanted_velocity=np.array([0.0, -0.5]))
-    np.testing.assert_allclose(LateralCost(nonholonomic=True).compute(along), 0, atol=1e-12)
+    expected = 2.0 * share**2 * (np.pi / 2 - 0.3) ** 2
+    np.testing.assert_allclose(LateralCost(nonholonomic=True).compute(e), expected)
+    anywhere = dataclasses.replace(e, facing=np.zeros(2))
+    np.testing.assert_array_equal(LateralCost(nonholonomic=True).compute(anywhere), 0)
     np.testing.assert_array_equal(LateralCost(nonholonomic=False).compute(e), 0)
+
+
+@pytest.mark.parametrize(
+    "heading, velocity, look, facing",
+    [
+        (0.0, [1.0, 0.0], 0.0, 0.0),  # ahead
+        (0.0, [-1.0, 0.0], 0.0, 0.0),  # behind: it backs up, and does not turn round
+        (0.1, [0.0, 10.0], 0.0, 1.54),  # far to the left: it turns there
+        (-1.2, [0.0, 10.0], 0.0, -1.54),  # facing away already: it backs up there
+        (0.0, [0.0, 0.3], 0.0, math.pi / 4),  # near the line, it closes in on it
+        (0.0, [0.0, 0.0], 0.4, 0.4),  # there: it faces as the goal looks
+    ],
+)
+def test_where_a_base_on_wheels_shall_face(heading, velocity, look, facing):
+    x, y = compute_facing(heading, np.array(velocity), look, speed=1.0)
+    assert math.atan2(y, x) == pytest.approx(facing, abs=0.01)
+    assert math.hypot(x, y) == pytest.approx(1)
+    # All of it turns with the world.
+    turned = quat_rotate(quat_from_yaw(0.5), np.array([*velocity, 0.0]))[:2]
+    x, y = compute_facing(heading + 0.5, turned, look + 0.5, speed=1.0)
+    assert math.atan2(y, x) == pytest.approx(facing + 0.5, abs=0.01)
+
+
+def test_the_last_centimetres_are_left_to_the_waist():
+    lengths = [
+        np.hypot(*compute_facing(0.0, np.array([0.3, 0.3]), 0.0, speed))
+        for speed in (0.0, 0.15, 0.225, 0.3, 2.0)
+    ]
+    np.testing.assert_allclose(lengths, [0, 0, 0.5, 1, 1])
 
 
 def test_every_term_has_its_own_name():

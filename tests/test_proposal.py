@@ -375,7 +375,7 @@ def test_the_residuals_derivative_equals_finite_differences(parts, name, mode):
 
     def linearise(command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         wanted = np.array([0.4, 0.3])
-        return proposal.linearise(qpos, command, goals, mode, DT, wanted_velocity=wanted)
+        return proposal.linearise(qpos, command, goals, mode, DT, facing=wanted)
 
     _, got = linearise(command)
     steps = 1e-6 * np.eye(len(command))

@@ -42,8 +42,7 @@ class CostWeights:
         terminal: w_f, factor on the tracking cost at the end of the horizon [1].
         support: Squared distance of the zero-moment point out of the safe support area [1/m²].
         lean: Squared distance of the centre of mass from where it rests on the base [1/m²].
-        lateral: Squared part of the wanted velocity across the heading of a base on wheels
-            [s²/m²].
+        lateral: Squared angle of a base on wheels to where it shall face [1/rad²].
         fall: Squared tilt of the base over the safe one, and height under it [1].
     """
 

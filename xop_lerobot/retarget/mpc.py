@@ -19,6 +19,7 @@ from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.config import CONSTRAINTS, MpcConfig, RetargeterConfig, split_names
 from xop_lerobot.retarget.costs import CollisionCost, FallCost, SupportArea, make_costs
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.retarget.costs.lateral import compute_facing
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.drift import DriftObserver
@@ -33,8 +34,7 @@ from xop_lerobot.retarget.readings import Readings
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
 from xop_lerobot.retarget.weighting import compute_effective_samples
 from xop_lerobot.state import Goal, RobotState
-
-_SLOW = 0.3  # speed up to which a base on wheels need not face where it goes [m/s]
+from xop_lerobot.transforms import quat_yaw
 
 
 class MpcRetargeter(Retargeter):
@@ -82,6 +82,9 @@ class MpcRetargeter(Retargeter):
         if morphology.support:
             resting = self.readings.compute_com(morphology.standing_qpos())
             self.support = SupportArea(morphology.support, tuple(resting[:2]))
+        standing = self.readings.compute_poses(morphology.standing_qpos(), morphology.frames)
+        # How far ahead of the base each tracked frame is at rest [m].
+        self._resting = {name: float(pose[0]) for name, pose in standing.items()}
         height = float(morphology.standing_qpos()[2])
         self._fall = FallCost(morphology.fall_tilt, morphology.fall_height, height)
         self.costs: tuple[Cost, ...] = make_costs(
@@ -213,8 +216,8 @@ class MpcRetargeter(Retargeter):
         poses = self.readings.compute_poses(state.qpos, self.sites)
         goal = hold_near(goal, poses, config.reach)
         goal = hold_level(goal, self._find_upright())
-        wanted = self._compute_wanted_velocity(poses, goal, config)
-        proposal = self._propose(state, goal, executed, held, drift, wanted, config)
+        facing = self._compute_facing(state, poses, goal, config)
+        proposal = self._propose(state, goal, executed, held, drift, facing, config)
         candidates = self._collect_candidates(state, goal, executed, proposal, config)
         candidates = np.where(acting, candidates, held)
         noise = self._noise[mode] * acting * self._compute_noise_share(poses, goal, config)
@@ -226,7 +229,7 @@ class MpcRetargeter(Retargeter):
         rolled = perf_counter()
         with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
             evaluation = self._evaluate(
-                prediction, commands, goal, executed, proposal, wanted, drift, config
+                prediction, commands, goal, executed, proposal, facing, drift, config
             )
             terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
         costs = np.sum(list(terms.values()), axis=0)
@@ -285,19 +288,26 @@ class MpcRetargeter(Retargeter):
         else:
             planner.shift(max(0.0, time - self._last[0]) / POLICY_DT)
 
-    def _compute_wanted_velocity(
-        self, poses: Mapping[str, np.ndarray], goal: Goal, config: MpcConfig
+    def _compute_facing(
+        self, state: RobotState, poses: Mapping[str, np.ndarray], goal: Goal, config: MpcConfig
     ) -> np.ndarray:
-        """Velocity that takes the first target to its goal in time, less a slow one. Shape (2,).
+        """Where a base on wheels shall face, to drive after the first target. Shape (2,).
 
-        At rest the base need not face the last centimetres: they are turned into, not driven.
+        A hand looks nowhere: for it the base may face as it does.
         """
-        if not self.command_model.is_nonholonomic:
+        if not self.command_model.is_nonholonomic or goal.mode is not Mode.MOBILE:
             return np.zeros(2)
-        for name, poses_then in self._preview(goal, config.proposal_s, config).items():
-            velocity = (poses_then[0, :2] - poses[name][:2]) / config.proposal_s
-            speed = float(np.linalg.norm(velocity))
-            return velocity * max(0.0, 1 - _SLOW / max(speed, 1e-9))
+        heading, pivot = float(quat_yaw(state.qpos[3:7])), self.command_model.pivot
+        hands = {arm.frame for arm in self.morphology.arms}
+        for name, then in self._preview(goal, config.proposal_s, config).items():
+            missing = then[0, :2] - poses[name][:2]
+            velocity, look = missing / config.proposal_s, heading
+            if name not in hands:
+                look = float(quat_yaw(then[0, 3:]))
+                end = then[0, :2] + (pivot - self._resting[name]) * _direction(look)
+                velocity = (end - state.qpos[:2] - pivot * _direction(heading)) / config.proposal_s
+            speed = float(np.hypot(*missing)) / config.proposal_s
+            return compute_facing(heading, velocity, look, speed)
         return np.zeros(2)
 
     def _preview(
@@ -312,7 +322,7 @@ class MpcRetargeter(Retargeter):
         executed: np.ndarray,
         held: np.ndarray,
         drift: np.ndarray,
-        wanted: np.ndarray,
+        facing: np.ndarray,
         config: MpcConfig,
     ) -> np.ndarray:
         """The kinematic proposal, or the executed command where there is none. Shape (n,)."""
@@ -329,7 +339,7 @@ class MpcRetargeter(Retargeter):
             executed=executed,
             offset=self.offset.offset,
             settled=self.offset.settled,
-            wanted_velocity=wanted,
+            facing=facing,
         )
         if not np.isfinite(proposal).all():
             return executed
@@ -411,7 +421,7 @@ class MpcRetargeter(Retargeter):
         goal: Goal,
         executed: np.ndarray,
         proposal: np.ndarray,
-        wanted: np.ndarray,
+        facing: np.ndarray,
         drift: np.ndarray,
         config: MpcConfig,
     ) -> Evaluation:
@@ -457,7 +467,7 @@ class MpcRetargeter(Retargeter):
             terminal_com=then.com,
             goals={name: poses[:-1] for name, poses in goals.items()},
             terminal_goals={name: poses[-1] for name, poses in goals.items()},
-            wanted_velocity=wanted,
+            facing=facing,
             mode=goal.mode,
             dt=POLICY_DT,
             weights=config.weights,
@@ -493,3 +503,8 @@ def _override(config: MpcConfig, settings: RetargeterConfig) -> MpcConfig:
         if getattr(settings, name)
     }
     return replace(config, **wanted)
+
+
+def _direction(heading: float) -> np.ndarray:
+    """Unit vector of a heading. Shape (2,)."""
+    return np.array([np.cos(heading), np.sin(heading)])

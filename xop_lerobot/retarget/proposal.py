@@ -35,7 +35,7 @@ class ProposalWeights:
         change: Of its distance from the executed command, over its scale [1].
         support: Of the centre of mass beyond the support area [1/m].
         lean: Of the centre of mass from where it rests on the base [1/m].
-        lateral: Of the wanted velocity across the heading of a base on wheels [s/m].
+        lateral: Of the heading of a base on wheels beside where it shall face [1/rad].
     """
 
     position: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -124,7 +124,7 @@ class KinematicProposal:
         executed: np.ndarray | None = None,
         offset: np.ndarray | None = None,
         settled: np.ndarray | None = None,
-        wanted_velocity: np.ndarray | None = None,
+        facing: np.ndarray | None = None,
         free: np.ndarray | None = None,
     ) -> np.ndarray:
         """Compute the proposed command.
@@ -139,7 +139,7 @@ class KinematicProposal:
             executed: Command executed now, from which the robot ramps. Shape (k,).
             offset: As for `CommandModel.extrapolate`. Shape (k,).
             settled: As for `CommandModel.extrapolate`. Shape (k,).
-            wanted_velocity: Velocity that a base on wheels shall be able to give [m/s]. (2,).
+            facing: Where a base on wheels shall face, as in `Evaluation`. Shape (2,).
             free: Which entries may move; all that act by default. Shape (k,), bool.
 
         Returns:
@@ -176,7 +176,7 @@ class KinematicProposal:
                 executed=executed,
                 offset=offset,
                 settled=settled,
-                wanted_velocity=wanted_velocity,
+                facing=facing,
             )
             share = (command[index] - space.neutral[index]) / scale
             moved = change * (command[index] - last) / scale
@@ -211,7 +211,7 @@ class KinematicProposal:
         executed: np.ndarray | None = None,
         offset: np.ndarray | None = None,
         settled: np.ndarray | None = None,
-        wanted_velocity: np.ndarray | None = None,
+        facing: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the weighted errors after `dt` of a command and their derivative by it.
 
@@ -235,8 +235,8 @@ class KinematicProposal:
             jacobians.append(gain[:, None] * (by_rotation @ (angular @ motion)))
         if self.support is not None:
             self._add_support(future, motion, residuals, jacobians)
-        if model.is_nonholonomic and wanted_velocity is not None and weights.lateral:
-            self._add_lateral(future, motion, wanted_velocity, residuals, jacobians)
+        if model.is_nonholonomic and facing is not None and weights.lateral:
+            self._add_lateral(future, motion, facing, residuals, jacobians)
         return np.concatenate(residuals), np.concatenate(jacobians)
 
     def _add_support(
@@ -265,18 +265,16 @@ class KinematicProposal:
         self,
         future: np.ndarray,
         motion: np.ndarray,
-        wanted: np.ndarray,
+        facing: np.ndarray,
         residuals: list[np.ndarray],
         jacobians: list[np.ndarray],
     ) -> None:
-        """Wanted velocity across the heading, which wheels cannot give."""
-        yaw = float(quat_yaw(future[3:7]))
-        lateral = compute_lateral(future[:7], wanted)
-        along = math.cos(yaw) * wanted[0] + math.sin(yaw) * wanted[1]
+        """Heading of the base beside where it shall face."""
+        lateral = float(compute_lateral(future[:7], facing))
         # A turn about the vertical by one radian turns the heading by one.
         turn = quat_rotate(future[3:7], motion[3:6].T)[:, 2]
         residuals.append(np.array([self.weights.lateral * lateral]))
-        jacobians.append(-self.weights.lateral * along * turn[None])
+        jacobians.append(-self.weights.lateral * math.hypot(*facing) * turn[None])
 
 
 def pace(executed: np.ndarray, wanted: np.ndarray, reach: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ CONFIGS = {
         num_samples=16,
         horizon=10,
         noise_std={"v": 0.2, "yaw_rate": 0.3, **TORSO_NOISE},
-        weights=CostWeights(orientation=0.03, tilt_share=2.0, lean=50.0, lateral=0.15),
+        weights=CostWeights(orientation=0.1, tilt_share=2.0, lean=50.0, lateral=0.15),
         reach=0.4,
     ),
 }

@@ -34,7 +34,7 @@ class Evaluation:
         goals: Goal of each tracked frame at every step. Shapes (H + 1, 7).
         terminal_poses: Pose of each tracked frame at the end of the extrapolation. (K, 7).
         terminal_goals: Goal of each tracked frame then. Shapes (7,).
-        wanted_velocity: Velocity that takes the first tracked frame to its goal [m/s]. (2,).
+        facing: Where a base on wheels shall face, as long as that counts, 0 to 1. Shape (2,).
         mode: Mode of the robot.
         dt: Time between steps [s].
         weights: The weights.
@@ -56,7 +56,7 @@ class Evaluation:
     goals: Mapping[str, np.ndarray]
     terminal_poses: Mapping[str, np.ndarray]
     terminal_goals: Mapping[str, np.ndarray]
-    wanted_velocity: np.ndarray
+    facing: np.ndarray
     mode: Mode
     dt: float
     weights: CostWeights
