@@ -18,8 +18,9 @@ class ArmIk:
 
     Each solve starts from its own last solution, not from the measured arms, so that sensor
     noise and sagging never reach it. Joint limits and a joint speed limit hold by construction.
-    It keeps the forearms a distance from the rest of the body, except for what the servo lag
-    adds, and for what a single step misses, since each holds the distance to first order only.
+    It keeps elbows, forearms and hands a distance from the rest of the body, except for what the
+    servo lag adds, and for what a single step misses, since each holds the distance to first
+    order only.
     The posture term pulls weakly towards the rest angles and keeps the elbows from drifting
     through the null space.
 
@@ -145,12 +146,13 @@ class ArmIk:
 
 
 def _find_pairs(model: mujoco.MjModel, morphology: Morphology) -> list[tuple[list[int], list[int]]]:
-    """Colliding geoms of each forearm and hand, against those of the rest of the body."""
+    """Colliding geoms of each arm from the elbow on, against those of the rest of the body."""
     solid = [i for i in range(model.ngeom) if model.geom_contype[i] and model.geom_conaffinity[i]]
     pairs, forearms = [], []
     for arm in morphology.arms:
         whole = _find_subtree(model, arm.joints[0])
-        forearm = _find_subtree(model, arm.joints[len(arm.joints) // 2])
+        # From the upper arm's own turn on: an elbow touches the body before the hand does.
+        forearm = _find_subtree(model, arm.joints[len(arm.joints) // 2 - 1])
         own = [i for i in solid if model.geom_bodyid[i] in forearm]
         rest = [
             i
