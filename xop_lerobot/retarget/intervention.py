@@ -43,20 +43,21 @@ class Verdict(NamedTuple):
 
 
 def judge(
-    weights: np.ndarray, costs: np.ndarray, falls: np.ndarray, touches: np.ndarray, stop: int
+    weights: np.ndarray, costs: np.ndarray, falls: np.ndarray, touches: np.ndarray, stop: int | None
 ) -> Verdict:
     r"""Judge a plan by the samples it is the mean of.
 
     The risk is :math:`r = \sum_i w_i [\text{sample } i \text{ fails}]`. Up to 0.1 the plan stays.
     Above, the base's velocities are scaled by 1 − r. From 0.5 on, the cheapest sample
-    that does not fail takes its place, or the sample `stop` if all fail.
+    that does not fail takes its place. If all fail, it is the sample `stop`, or without one the
+    plan's posture at no velocity.
 
     Args:
         weights: Weights of the samples. Shape (K,).
         costs: Their costs, NaN for those that diverged. Shape (K,).
         falls: Which of them fall, or diverge. Shape (K,), bool.
         touches: Which of them touch an obstacle. Shape (K,), bool.
-        stop: Index of the sample that stops.
+        stop: Index of the sample that stops, None if there is none.
     """
     finite = np.isfinite(costs)
     if not finite.any():
@@ -71,5 +72,7 @@ def judge(
         return Verdict(reason, risk, scale=1 - risk)
     reason = Intervention.VETOED_FALL if is_fall else Intervention.VETOED_COLLISION
     safe = np.flatnonzero(~failing & finite)
+    if not len(safe) and stop is None:
+        return Verdict(reason, risk, scale=0.0)
     best = int(safe[np.argmin(costs[safe])]) if len(safe) else stop
     return Verdict(reason, risk, sample=best)

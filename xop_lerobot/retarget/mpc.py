@@ -236,12 +236,13 @@ class MpcRetargeter(Retargeter):
         if samples.penalty is not None:
             costs = costs + samples.penalty
         weights = planner.update(samples, costs)
-        stop = config.sample_plan + (
-            config.candidates.index("stop") if "stop" in config.candidates else 0
-        )
+        stop = None  # the index of the sample that stops: candidates follow the plan
+        if "stop" in config.candidates:
+            stop = config.sample_plan + config.candidates.index("stop")
+            stop = stop if stop < len(costs) else None
         falls = self._fall.find_falls(evaluation) | ~np.isfinite(costs)
         touches = self._collision.find_touches(evaluation)
-        verdict = judge(weights, costs, falls, touches, min(stop, len(costs) - 1))
+        verdict = judge(weights, costs, falls, touches, stop)
         planned = self._apply(verdict, planner, samples.commands, executed)
         planned = self.space.restrict(np.where(acting, planned, held), mode)
         best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
