@@ -18,10 +18,12 @@ HULL = {
     "hull_rear_left": 0.17,
     "hull_rear_right": 0.17,
     "head": 0.15,
+    "left_elbow": 0.1,
+    "right_elbow": 0.1,
     "left_palm": 0.1,
     "right_palm": 0.1,
 }
-"""Circles about these sites cover the base (to 5 cm beyond its corners), head and hands [m]."""
+"""Spheres about these cover the base (to 5 cm beyond its corners), head, elbows and hands [m]."""
 
 EFFECTS = (
     Effect(Acts.FORWARD),

@@ -118,6 +118,8 @@ SITES = (
     Frame("right_wrist", "ee_right", (0, 0, 0), (0, 0, -1), (0, -1, 0)),
     Frame("left_palm", "ee_left", (0, 0, -0.12), (0, 0, -1), (0, 1, 0)),
     Frame("right_palm", "ee_right", (0, 0, -0.12), (0, 0, -1), (0, -1, 0)),
+    Frame("left_elbow", "link_left_arm_3", (0, 0, 0)),
+    Frame("right_elbow", "link_right_arm_3", (0, 0, 0)),
     Frame("hull_front_left", "base", (0.19, 0.145, 0.2)),
     Frame("hull_front_right", "base", (0.19, -0.145, 0.2)),
     Frame("hull_rear_left", "base", (-0.22, 0.145, 0.2)),
