@@ -50,7 +50,7 @@ def judge(
     The risk is :math:`r = \sum_i w_i [\text{sample } i \text{ fails}]`. Up to 0.1 the plan stays.
     Above, the base's velocities are scaled by 1 − r. From 0.5 on, the cheapest sample
     that does not fail takes its place. If all fail, it is the sample `stop`, or without one the
-    plan's posture at no velocity.
+    executed posture at no velocity.
 
     Args:
         weights: Weights of the samples. Shape (K,).

@@ -192,6 +192,7 @@ class MpcRetargeter(Retargeter):
         with self._lock:
             self._rng = np.random.default_rng(self._seed)
             self._last = None
+            self._direct = None
             self.drift.reset()
             self.offset.reset(self.decision.join(state.command, state.arms))
             for planner in self._planners.values():
@@ -233,9 +234,7 @@ class MpcRetargeter(Retargeter):
             )
             terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
         costs = np.sum(list(terms.values()), axis=0)
-        if samples.penalty is not None:
-            costs = costs + samples.penalty
-        weights = planner.update(samples, costs)
+        weights = planner.update(samples, costs)  # which adds the samples' own penalty
         stop = None  # the index of the sample that stops: candidates follow the plan
         if "stop" in config.candidates:
             stop = config.sample_plan + config.candidates.index("stop")
