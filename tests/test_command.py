@@ -67,6 +67,91 @@ def test_mobile_entries_go_to_neutral_at_their_rate_in_stationary_mode():
     np.testing.assert_array_equal(SPACE.limit(walking, None, 0.1, Mode.STATIONARY), [0.7, 0.0])
 
 
+SWAYING = CommandSpace(
+    (
+        CommandDim("height", "height.pos", "m", 0.5, 0.8, 0.75, 0.5),
+        CommandDim(
+            "vx", "x.vel", "m/s", -1.0, 1.0, 0.0, 2.0, mobile_only=True, sway=0.15, sway_rate=0.1
+        ),
+        CommandDim("yaw_rate", "theta.vel", "rad/s", -1.0, 1.0, 0.0, 3.0, mobile_only=True),
+    )
+)
+"""A space whose first velocity may sway a standing robot, and whose second may not."""
+
+three = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
+executable = st.tuples(st.floats(0.5, 0.8), st.floats(-1, 1), st.floats(-1, 1)).map(np.array)
+
+
+def test_stationary_leaves_a_sway_and_nothing_else_of_a_velocity():
+    walking = np.array([0.7, 0.6, -0.4])
+    got = SWAYING.restrict(walking, Mode.STATIONARY)
+    np.testing.assert_array_equal(got, [0.7, 0.15, 0.0])
+    small = np.array([0.9, -0.1, 0.0])
+    np.testing.assert_array_equal(SWAYING.restrict(small, Mode.STATIONARY), [0.8, -0.1, 0.0])
+    np.testing.assert_array_equal(SWAYING.restrict(walking, Mode.MOBILE), walking)
+    batch = np.tile(walking, (2, 5, 1))
+    np.testing.assert_array_equal(SWAYING.restrict(batch, Mode.STATIONARY), np.tile(got, (2, 5, 1)))
+
+
+def test_at_rest_a_walking_robot_stops_and_a_standing_one_keeps_its_sway():
+    command = np.array([0.6, 0.1, 0.3])
+    np.testing.assert_array_equal(SWAYING.compute_rest(command, Mode.MOBILE), [0.6, 0.0, 0.0])
+    np.testing.assert_array_equal(SWAYING.compute_rest(command, Mode.STATIONARY), [0.6, 0.1, 0.0])
+
+
+@pytest.mark.parametrize(
+    "mode, velocity, rate",
+    [
+        (Mode.MOBILE, 0.0, 2.0),
+        (Mode.STATIONARY, 0.0, 0.1),
+        (Mode.STATIONARY, 0.15, 0.1),
+        (Mode.STATIONARY, np.float32(0.15), 0.1),  # as the robot executes it
+        (Mode.STATIONARY, 0.2, 2.0),  # faster than any sway: it is being stopped
+        (Mode.STATIONARY, -0.9, 2.0),
+    ],
+)
+def test_a_sway_is_slow_and_a_stop_is_not(mode, velocity, rate):
+    got = SWAYING.compute_max_rate(mode, np.array([0.75, velocity, 0.0]))
+    np.testing.assert_array_equal(got, [0.5, rate, 3.0])
+
+
+def test_without_a_sway_the_rates_are_always_the_same():
+    for mode in Mode:
+        np.testing.assert_array_equal(SPACE.compute_max_rate(mode, SPACE.neutral), SPACE.max_rate)
+
+
+def test_a_robot_that_walked_stops_fast_and_then_sways_slowly():
+    """From 1 m/s at 2 m/s² to the largest sway, and on to the other one at 0.1 m/s²."""
+    command, seen = np.array([0.75, 1.0, 0.0]), []
+    for _ in range(100):
+        command = SWAYING.limit([0.75, -0.15, 0.0], command, 0.04, Mode.STATIONARY)
+        seen.append(command[1])
+    steps = -np.diff([1.0, *seen])
+    assert steps[:10] == pytest.approx(0.08)
+    slow = np.flatnonzero(np.array(seen) <= 0.15 + 1e-6)[0] + 1
+    assert (steps[slow:] <= 0.004 + 1e-12).all()
+    assert seen[-1] == pytest.approx(-0.15)
+
+
+@given(three, executable, periods, modes)
+def test_limiting_in_single_precision_twice_is_limiting_once(command, previous, dt, mode):
+    """What is recorded, as a float32, is what the robot executes when it limits again."""
+    previous = previous.astype(np.float32).astype(float)
+    once = SWAYING.limit(command, previous, dt, mode).astype(np.float32).astype(float)
+    twice = SWAYING.limit(once, previous, dt, mode).astype(np.float32).astype(float)
+    np.testing.assert_array_equal(twice, once)
+
+
+@given(three, executable, periods)
+def test_a_sway_never_gets_out_of_hand(command, previous, dt):
+    """Whatever it starts with, a standing robot's velocity comes to its bounds and stays there."""
+    executed = previous
+    for _ in range(60):
+        executed = SWAYING.limit(command, executed, dt, Mode.STATIONARY)
+    assert abs(executed[1]) <= 0.15 + 1e-12
+    assert executed[2] == 0
+
+
 def test_a_previous_command_out_of_bounds_is_left_at_its_rate():
     np.testing.assert_allclose(
         SPACE.limit(np.array([0.75, 0]), np.array([1.0, 0]), 0.1, Mode.MOBILE), [0.95, 0.0]

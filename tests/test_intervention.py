@@ -77,6 +77,15 @@ def test_where_all_fail_it_stops():
     assert verdict.risk == pytest.approx(1.0)
 
 
+def test_where_all_fail_and_none_stops_the_base_does():
+    verdict = judge_by_hand([0.4, 0.3, 0.2, 0.1], [1.0, 2.0, 3.0, 4.0], falls=[True] * 4, stop=None)
+    assert (verdict.intervention, verdict.sample, verdict.scale) == (
+        Intervention.VETOED_FALL,
+        None,
+        0.0,
+    )
+
+
 def test_a_safe_sample_that_diverged_is_not_taken():
     verdict = judge_by_hand(
         [0.9, 0.0, 0.1, 0.0], [1.0, NAN, 5.0, NAN], falls=[True, False, False, False]

@@ -210,20 +210,23 @@ def test_a_wall_before_the_goal_is_not_driven_into(walled):
 # -- determinism ---------------------------------------------------------------------------
 
 
-def run(b: Bench, ticks: int = 6) -> list[np.ndarray]:
-    goal = b.make_goal(Mode.MOBILE, (0.2, 0.1, 0), 0.2)
+def run(b: Bench, ticks: int = 6, mode: Mode = Mode.MOBILE) -> list[np.ndarray]:
+    goal = b.make_goal(mode, (0.2, 0.1, -0.05), 0.2)
     return [b.tick(goal).commands for _ in range(ticks)]
 
 
 @robots
-def test_same_seed_same_plans(bench, name):
-    first, same, other = (run(bench(name, seed=seed)) for seed in (1, 1, 2))
+@modes
+def test_same_seed_same_plans(bench, name, mode):
+    first, same, other = (run(bench(name, seed=seed), mode=mode) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, same)
     assert (np.array(first) != np.array(other)).any()
 
 
-def test_threads_do_not_change_the_plan(bench):
-    one, two = (run(bench("g1", threads=threads), 3) for threads in (1, 2))
+@robots
+@modes
+def test_threads_do_not_change_the_plan(bench, name, mode):
+    one, two = (run(bench(name, threads=threads), 3, mode) for threads in (1, 2))
     np.testing.assert_array_equal(one, two)
 
 
