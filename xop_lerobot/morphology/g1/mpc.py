@@ -26,7 +26,7 @@ CONFIGS = {
         horizon=8,
         noise_std={"height": 0.03, "waist_yaw": 0.1, "waist_roll": 0.05, "waist_pitch": 0.1,
                    "vx": 0.06, "vy": 0.04},
-        weights=CostWeights(orientation=0.2, stance=0.05),
+        weights=CostWeights(orientation=0.2, stance=0.05, change=0.05),
     ),
     Mode.MOBILE: MpcConfig(
         num_samples=12,
@@ -35,7 +35,7 @@ CONFIGS = {
             "waist_roll": 0.03, "waist_pitch": 0.05, "vx": 0.25, "vy": 0.2, "yaw_rate": 0.3,
         },
         # A walking robot that leans as its operator does pays with its balance.
-        weights=CostWeights(orientation=0.1, tilt_share=0.5),
+        weights=CostWeights(orientation=0.1, tilt_share=0.5, change=0.05),
     ),
 }  # fmt: skip
 
