@@ -439,9 +439,9 @@ def test_lateral_is_the_angle_to_where_the_base_shall_face(share):
     [
         (0.0, [1.0, 0.0], 0.0, 0.0),  # ahead
         (0.0, [-1.0, 0.0], 0.0, 0.0),  # behind: it backs up, and does not turn round
-        (0.1, [0.0, 10.0], 0.0, 1.54),  # far to the left: it turns there
-        (-1.2, [0.0, 10.0], 0.0, -1.54),  # facing away already: it backs up there
-        (0.0, [0.0, 0.3], 0.0, math.pi / 4),  # near the line, it closes in on it
+        (0.1, [0.0, 10.0], 0.0, 1.56),  # far to the left: it turns there
+        (-1.2, [0.0, 10.0], 0.0, -1.56),  # facing away already: it backs up there
+        (0.0, [0.0, 0.1], 0.0, math.pi / 4),  # near the line, it closes in on it
         (0.0, [0.0, 0.0], 0.4, 0.4),  # there: it faces as the goal looks
     ],
 )

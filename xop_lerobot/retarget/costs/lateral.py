@@ -9,7 +9,7 @@ import numpy as np
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.transforms import quat_yaw, wrap_angle
 
-_LOOKING = 0.3  # speed at which the way to go and where the goal looks count alike [m/s]
+_LOOKING = 0.1  # speed at which the way to go and where the goal looks count alike [m/s]
 _REST, _FULL = 0.15, 0.3  # speeds of the head from which on the base is to face so [m/s]
 _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
 _BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
