@@ -198,7 +198,7 @@ def test_targets_out_of_their_limits_come_back(arms, solvers, name):
 @pytest.mark.parametrize("depth", [0.0, -0.1])
 def test_a_goal_inside_the_body_is_not_followed_into_it(arms, solvers, name, depth):
     a, ik = arms[name], solvers[name]
-    head = SiteKinematics(a.model, ("head",)).compute_positions(a.qpos)["head"]
+    head = SiteKinematics(a.model, ("head",)).compute_poses(a.qpos)["head"][:3]
     goals = a.compute_wrists(a.rest)
     for goal in goals.values():
         goal[:3] = head + [depth, 0, -0.35]

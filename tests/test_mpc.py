@@ -172,7 +172,7 @@ def walled() -> tuple[Morphology, mujoco.MjModel, float]:
     spec = morphology.build_spec("planning")
     add_sensing(spec, morphology)
     add_floor(spec, seen=False)
-    heads = SiteKinematics(spec.compile(), ("head",)).compute_positions(morphology.standing_qpos())
+    heads = SiteKinematics(spec.compile(), ("head",)).compute_poses(morphology.standing_qpos())
     wall = float(heads["head"][0]) + 0.9
     add_block(spec, "wall", (wall + 0.05, 0, 1), (0.05, 3, 1), (1, 1, 1, 1))
     return morphology, spec.compile(), wall
