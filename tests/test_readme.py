@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import lerobot_teleoperator_xop  # noqa: F401  registers robots and teleoperator
+from xop_lerobot.evaluation.bench import parse_arguments as parse_bench
 from xop_lerobot.operator.recording import load_recording
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -98,6 +99,9 @@ def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.Monk
     if command[0] == "xop-control":
         check_control(command[1:])
         return
+    if command[0] == "xop-bench":
+        parse_bench(command[1:])
+        return
     config = parse(command, monkeypatch)
     dataset = getattr(config, "dataset", None)
     if dataset is not None and hasattr(config, "robot") and hasattr(dataset, "num_episodes"):
@@ -115,7 +119,7 @@ def test_the_main_commands_are_told() -> None:
     told = {command[0] for command in read_commands(ROOT / "README.md")}
     assert told >= {
         "make", "lerobot-record", "lerobot-teleoperate", "lerobot-replay", "lerobot-train",
-        "lerobot-rollout", "xop-record",
+        "lerobot-rollout", "xop-record", "xop-control", "xop-bench",
     }  # fmt: skip
 
 
