@@ -77,7 +77,7 @@ class Bench:
             self.evaluations.append(evaluate(*args))
             return self.evaluations[-1]
 
-        self.retargeter._evaluate = watched
+        self.retargeter._evaluate = watched  # type: ignore[method-assign]
 
     def make_goal(self, mode: Mode, offset=(0.25, 0.05, -0.05)) -> Goal:
         pose = self.head.copy()

@@ -124,7 +124,7 @@ def test_a_robot_that_walked_stops_fast_and_then_sways_slowly():
     """From 1 m/s at 2 m/s² to the largest sway, and on to the other one at 0.1 m/s²."""
     command, seen = np.array([0.75, 1.0, 0.0]), []
     for _ in range(100):
-        command = SWAYING.limit([0.75, -0.15, 0.0], command, 0.04, Mode.STATIONARY)
+        command = SWAYING.limit(np.array([0.75, -0.15, 0.0]), command, 0.04, Mode.STATIONARY)
         seen.append(command[1])
     steps = -np.diff([1.0, *seen])
     assert steps[:10] == pytest.approx(0.08)

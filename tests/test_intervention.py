@@ -16,7 +16,7 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs import CollisionCost
-from xop_lerobot.retarget.intervention import Intervention, judge
+from xop_lerobot.retarget.intervention import Intervention, Verdict, judge
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Plan, Status
@@ -27,9 +27,14 @@ NAN = np.nan
 NONE = [False] * 4
 
 
-def judge_by_hand(weights, costs, falls=NONE, touches=NONE, stop=3):
-    arrays = (np.array(column) for column in (weights, costs, falls, touches))
-    return judge(*arrays, stop)
+def judge_by_hand(
+    weights: list[float],
+    costs: list[float],
+    falls: list[bool] = NONE,
+    touches: list[bool] = NONE,
+    stop: int | None = 3,
+) -> Verdict:
+    return judge(np.array(weights), np.array(costs), np.array(falls), np.array(touches), stop)
 
 
 # -- by hand -------------------------------------------------------------------------------
@@ -48,12 +53,14 @@ def test_a_failure_that_hardly_counts_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    "kind, reason",
-    [("falls", Intervention.SLOWED_FALL), ("touches", Intervention.SLOWED_COLLISION)],
+    "falls, reason",
+    [(True, Intervention.SLOWED_FALL), (False, Intervention.SLOWED_COLLISION)],
 )
-def test_some_of_the_weight_on_failures_slows(kind, reason):
+def test_some_of_the_weight_on_failures_slows(falls, reason):
     failing = [False, True, False, False]
-    verdict = judge_by_hand([0.5, 0.3, 0.1, 0.1], [1.0, 2.0, 3.0, 4.0], **{kind: failing})
+    verdict = judge_by_hand(
+        [0.5, 0.3, 0.1, 0.1], [1.0, 2.0, 3.0, 4.0], *((failing, NONE) if falls else (NONE, failing))
+    )
     assert verdict.intervention is reason
     assert verdict.sample is None
     assert verdict.risk == pytest.approx(0.3)
@@ -61,12 +68,14 @@ def test_some_of_the_weight_on_failures_slows(kind, reason):
 
 
 @pytest.mark.parametrize(
-    "kind, reason",
-    [("falls", Intervention.VETOED_FALL), ("touches", Intervention.VETOED_COLLISION)],
+    "falls, reason",
+    [(True, Intervention.VETOED_FALL), (False, Intervention.VETOED_COLLISION)],
 )
-def test_most_of_it_takes_the_cheapest_sample_that_is_safe(kind, reason):
+def test_most_of_it_takes_the_cheapest_sample_that_is_safe(falls, reason):
     failing = [True, False, False, False]
-    verdict = judge_by_hand([0.6, 0.1, 0.2, 0.1], [1.0, 3.0, 2.0, 4.0], **{kind: failing})
+    verdict = judge_by_hand(
+        [0.6, 0.1, 0.2, 0.1], [1.0, 3.0, 2.0, 4.0], *((failing, NONE) if falls else (NONE, failing))
+    )
     assert (verdict.intervention, verdict.sample, verdict.scale) == (reason, 2, 1.0)
     assert verdict.risk == pytest.approx(0.6)
 
