@@ -46,9 +46,10 @@ CONFIGS = {
     ),
     Mode.MOBILE: MpcConfig(
         num_samples=16,
-        horizon=10,
+        # Shorter ones do not see a torso collapse when the base turns at speed.
+        horizon=14,
         noise_std={"v": 0.2, "yaw_rate": 0.3, **TORSO_NOISE},
-        weights=CostWeights(orientation=0.1, tilt_share=2.0, lean=50.0, lateral=0.15),
+        weights=CostWeights(orientation=0.1, tilt_share=2.0, lean=50.0, lateral=0.4),
         reach=0.4,
     ),
 }
