@@ -7,8 +7,6 @@ import logging
 import threading
 import time
 
-import numpy as np
-
 from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
