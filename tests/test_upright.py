@@ -9,6 +9,7 @@ from test_costs import H, K, draw_poses, make_evaluation
 from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs import UprightCost
 from xop_lerobot.retarget.costs.upright import (
+    compute_side,
     compute_upright,
     compute_upright_error,
     make_level,
@@ -24,7 +25,7 @@ def rotate_z(quat: np.ndarray) -> np.ndarray:
 
 def test_upright_equals_its_formula():
     e = make_evaluation(weights=CostWeights(upright=0.7), upright=("left_wrist",))
-    up = np.array([0, 0, 1.0])
+    up = np.array([0, 0, 1.0 if rotate_z(e.terminal_goals["left_wrist"][3:])[2] >= 0 else -1.0])
     expected = []
     for i in range(K):
         steps = [
@@ -61,15 +62,38 @@ def test_the_derivative_of_h_is_that_of_a_turned_vector():
 def test_a_levelled_goal_is_the_nearest_upright_one():
     poses = draw_poses(np.random.default_rng(1), 50)
     level = make_level(poses)
-    np.testing.assert_allclose(compute_upright(level), 0, atol=1e-20)
+    side = compute_side(poses)
+    assert set(side) == {-1.0, 1.0}
+    np.testing.assert_allclose(compute_upright(level, side), 0, atol=1e-20)
     np.testing.assert_array_equal(level[:, :3], poses[:, :3])
     # The least angle is that between the two verticals.
     up = compute_upright_error(poses)[:, 2] + 1
     turn = np.linalg.norm(rotation_error(level[:, 3:], poses[:, 3:]), axis=1)
-    np.testing.assert_allclose(turn, np.arccos(up), atol=1e-7)
+    np.testing.assert_allclose(turn, np.arccos(side * up), atol=1e-7)
     np.testing.assert_allclose(make_level(level), level, atol=1e-9)
 
 
-def test_a_hand_upside_down_is_levelled_too():
-    pose = make_pose(np.zeros(3), quat_exp(np.array([np.pi, 0, 0])))
-    assert compute_upright(make_level(pose)) == pytest.approx(0, abs=1e-12)
+def test_an_open_palm_stays_up():
+    """As under a tray: a tilt of 0.2 rad is levelled, the hand is not turned over."""
+    pose = make_pose(np.zeros(3), quat_exp(np.array([np.pi - 0.2, 0, 0])))
+    level = make_level(pose)
+    assert compute_side(pose) == compute_side(level) == -1
+    assert compute_upright(level, -1.0) == pytest.approx(0, abs=1e-12)
+    assert np.linalg.norm(rotation_error(level[3:], pose[3:])) == pytest.approx(0.2)
+
+
+def test_each_hand_is_kept_on_its_own_side():
+    """Of two samples, one with the palm up and one down, the operator's side costs nothing."""
+    down = make_pose(np.zeros(3), quat_from_rpy(0, 0, 0.7))
+    up = make_pose(np.zeros(3), quat_multiply(down[3:], quat_exp(np.array([np.pi, 0, 0]))))
+    poses = np.tile(np.stack([down, up])[:, None], (1, H + 1, 1))
+    for goal, costs in ((down, [0, 8]), (up, [8, 0])):
+        e = make_evaluation(
+            weights=CostWeights(upright=1.0),
+            upright=("left_wrist",),
+            qpos=np.zeros((2, H + 1, 9)),
+            poses={"left_wrist": poses},
+            terminal_poses={"left_wrist": poses[:, -1]},
+            terminal_goals={"left_wrist": goal},
+        )
+        np.testing.assert_allclose(UprightCost().compute(e), costs, atol=1e-12)

@@ -13,12 +13,12 @@ _UP = np.array([0.0, 0.0, 1.0])
 class UprightCost(Cost):
     r"""Mean over steps, and at the end of the extrapolation, of :math:`w_u\sum_f\|h_f\|^2`.
 
-    .. math:: h = R(\theta)\,R_{ee}(q)\,e_z - e_z
+    .. math:: h = R(\theta)\,R_{ee}(q)\,e_z - s\,e_z
 
     of each hand that is to stay level: the paper's constraint of Version 2, as a penalty. The Z
-    of a wrist points out of the back of the hand, so h vanishes where the palm faces down, and
-    for a small tilt α is :math:`\|h\|^2 = 2(1 - \cos\alpha) \approx \alpha^2`. It leaves the
-    heading of the hand free.
+    of a wrist points out of the back of the hand; s is 1 where the operator's palm faces down,
+    and -1 where it faces up, as under a tray. For a small tilt α is
+    :math:`\|h\|^2 = 2(1 - \cos\alpha) \approx \alpha^2`. It leaves the heading of the hand free.
     """
 
     name = "upright"
@@ -27,32 +27,36 @@ class UprightCost(Cost):
         """Cost of every sample. Shape (K,)."""
         total = np.zeros(len(evaluation.qpos))
         for name in evaluation.upright:
-            moving = compute_upright(evaluation.poses[name][:, 1:]).mean(axis=1)
-            total += moving + compute_upright(evaluation.terminal_poses[name])
+            sign = compute_side(evaluation.terminal_goals[name])
+            moving = compute_upright(evaluation.poses[name][:, 1:], sign).mean(axis=1)
+            total += moving + compute_upright(evaluation.terminal_poses[name], sign)
         return evaluation.weights.upright * total
 
 
-def compute_upright(poses: np.ndarray) -> np.ndarray:
-    r""":math:`\|R e_z - e_z\|^2` of poses. Shape (..., 7) -> (...)."""
-    return np.square(compute_upright_error(poses)).sum(-1)
+def compute_side(pose: np.ndarray) -> np.ndarray:
+    """Side of a hand that is up: 1 for its back, -1 for its palm. Shape (..., 7) -> (...)."""
+    return np.where(quat_rotate(pose[..., 3:], _UP)[..., 2] < 0, -1.0, 1.0)
 
 
-def compute_upright_error(poses: np.ndarray) -> np.ndarray:
-    r""":math:`h = R e_z - e_z` of poses. Shape (..., 7) -> (..., 3)."""
-    return quat_rotate(poses[..., 3:], _UP) - _UP
+def compute_upright(poses: np.ndarray, side: np.ndarray | float = 1.0) -> np.ndarray:
+    r""":math:`\|R e_z - s e_z\|^2` of poses. Shape (..., 7) -> (...)."""
+    return np.square(compute_upright_error(poses, side)).sum(-1)
+
+
+def compute_upright_error(poses: np.ndarray, side: np.ndarray | float = 1.0) -> np.ndarray:
+    r""":math:`h = R e_z - s e_z` of poses. Shape (..., 7) -> (..., 3)."""
+    return quat_rotate(poses[..., 3:], _UP) - np.asarray(side)[..., None] * _UP
 
 
 def make_level(pose: np.ndarray) -> np.ndarray:
     """Turn a pose by the least angle that makes its Z vertical. Shape (..., 7) -> (..., 7).
 
     What the operator's hand asks for while it is to stay level: tracking its tilt too would
-    compete with the constraint. Upside down the axis of the turn is open; X is taken.
+    compete with the constraint. The side of the hand that is up stays up.
     """
-    up = quat_rotate(pose[..., 3:], _UP)
+    up = compute_side(pose)[..., None] * quat_rotate(pose[..., 3:], _UP)
     x, y, z = np.moveaxis(up, -1, 0)
     sine = np.hypot(x, y)
     scale = np.arctan2(sine, z) / np.maximum(sine, 1e-12)
     turn = np.stack([y * scale, -x * scale, np.zeros_like(x)], axis=-1)
-    flipped = (sine < 1e-9) & (z < 0)
-    turn = np.where(flipped[..., None], np.array([np.pi, 0, 0]), turn)
     return make_pose(pose[..., :3], quat_multiply(quat_exp(turn), pose[..., 3:]))
