@@ -100,7 +100,7 @@ def test_a_bad_name_changes_nothing(bench, changes, text):
     retargeter = bench.retargeter
     before = (
         retargeter.configs, retargeter.frames, retargeter.constraints, retargeter.sites,
-        retargeter._planners, retargeter._noise, retargeter.proposals,
+        retargeter._planners, retargeter._noise, retargeter.candidates.proposals,
     )  # fmt: skip
     body = retargeter.command_model.body.copy()
     good = {
@@ -114,7 +114,7 @@ def test_a_bad_name_changes_nothing(bench, changes, text):
     assert str(caught.value).startswith(text)
     after = (
         retargeter.configs, retargeter.frames, retargeter.constraints, retargeter.sites,
-        retargeter._planners, retargeter._noise, retargeter.proposals,
+        retargeter._planners, retargeter._noise, retargeter.candidates.proposals,
     )  # fmt: skip
     assert all(old is new for old, new in zip(before, after, strict=True))
     np.testing.assert_array_equal(retargeter.command_model.body, body)

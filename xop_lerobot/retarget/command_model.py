@@ -113,6 +113,24 @@ class CommandModel:
         """Height and joint angles that the entries act on; 0 for velocities. (nq,) -> (k,)."""
         return np.where(self._is_velocity, 0.0, qpos[self._address])
 
+    def limit_rates(
+        self, executed: np.ndarray, commands: np.ndarray, mode: Mode, dt: float
+    ) -> np.ndarray:
+        """What the rate limits make of command sequences with a step of `dt` [s].
+
+        Shapes (k,), (K, H, k) -> (K, H, k).
+        """
+        step = self.space.compute_max_rate(mode, executed) * dt
+        horizon = commands.shape[1]
+        if (commands == commands[:, :1]).all():  # a command that is held is approached straight
+            reach = step * np.arange(1, horizon + 1)[:, None]
+            return np.clip(commands, executed - reach, executed + reach)
+        limited = np.empty_like(commands)
+        for k in range(horizon):
+            executed = np.clip(commands[:, k], executed - step, executed + step)
+            limited[:, k] = executed
+        return limited
+
     def settle(self, settled: np.ndarray, command: np.ndarray, dt: float) -> np.ndarray:
         """Command that the robot has taken up, with its lags, after `dt` [s] more. (..., k)."""
         return command + (settled - command) * np.exp(-dt / self._lag)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from xop_lerobot.errors import BadValue, UnknownName
 
@@ -236,6 +236,13 @@ class RetargeterConfig:
         for name in ("num_samples", "horizon", "control_hz", "threads"):
             if getattr(self, name) < 0:
                 raise BadValue(f"{name} must not be negative, got {getattr(self, name)}")
+
+    def override(self, config: MpcConfig) -> MpcConfig:
+        """Put what the user set into a robot's own parameters; zeros leave them."""
+        names = ("num_samples", "horizon", "control_hz")
+        return replace(
+            config, **{name: getattr(self, name) for name in names if getattr(self, name)}
+        )
 
     @property
     def num_threads(self) -> int:

@@ -64,3 +64,22 @@ class DecisionSpace:
     def join(self, command: np.ndarray, arms: np.ndarray) -> np.ndarray:
         """Decision vector of a command and the arms' targets (grippers are left out). (n,)."""
         return np.concatenate([command, arms[: len(self.joints)]])
+
+    def split(
+        self, decisions: np.ndarray, arms: np.ndarray, body: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Commands and arm targets of decisions; grippers stay as they are.
+
+        Args:
+            decisions: Decisions. Shape (K, H, n).
+            arms: Arm and gripper targets now. Shape (m,).
+            body: Which entries are decided; without arms among them `arms` is what it is. (n,).
+
+        Returns:
+            Commands, shape (K, H, k), and arm targets, shape (m,) or (K, H, m).
+        """
+        commands, count = decisions[..., : self.num_commands], len(self.joints)
+        if body[self.num_commands :].any():
+            grippers = np.broadcast_to(arms[count:], (*decisions.shape[:2], len(arms) - count))
+            arms = np.concatenate([decisions[..., self.num_commands :], grippers], axis=-1)
+        return commands, arms

@@ -15,26 +15,24 @@ from xop_lerobot.command import Mode
 from xop_lerobot.errors import UnknownName
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.candidates import Candidates
 from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.config import CONSTRAINTS, MpcConfig, RetargeterConfig, split_names
 from xop_lerobot.retarget.costs import CollisionCost, FallCost, SupportArea, make_costs
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.retarget.costs.lateral import compute_facing
 from xop_lerobot.retarget.decision import DecisionSpace
-from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.drift import DriftObserver
+from xop_lerobot.retarget.facing import FacingRule
 from xop_lerobot.retarget.horizon_goals import hold_level, hold_near, preview
 from xop_lerobot.retarget.intervention import Verdict, judge
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.offset import OffsetObserver
 from xop_lerobot.retarget.optimizer import SamplingOptimizer, build_optimizer
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
-from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights, pace
 from xop_lerobot.retarget.readings import Readings
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
 from xop_lerobot.retarget.weighting import compute_effective_samples
 from xop_lerobot.state import Goal, RobotState
-from xop_lerobot.transforms import quat_yaw
 
 
 class MpcRetargeter(Retargeter):
@@ -83,27 +81,34 @@ class MpcRetargeter(Retargeter):
             resting = self.readings.compute_com(morphology.standing_qpos())
             self.support = SupportArea(morphology.support, tuple(resting[:2]))
         standing = self.readings.compute_poses(morphology.standing_qpos(), morphology.frames)
-        # How far ahead of the base each tracked frame is at rest [m].
-        self._resting = {name: float(pose[0]) for name, pose in standing.items()}
+        self._facing = FacingRule(
+            morphology, {name: float(pose[0]) for name, pose in standing.items()}
+        )
+        self.candidates = Candidates(
+            morphology,
+            self.rollout.model,
+            self.decision,
+            self.command_model,
+            self.offset,
+            self.support,
+        )
         height = float(morphology.standing_qpos()[2])
         self._fall = FallCost(morphology.fall_tilt, morphology.fall_height, height)
         self.costs: tuple[Cost, ...] = make_costs(
             morphology, self.command_model, self.support, self._collision, self._fall
         )
         self.cost_names = tuple(cost.name for cost in self.costs)
-        self._direct: DirectRetargeter | None = None
         self._rng = np.random.default_rng(config.seed)
         self._seed = config.seed
         self._lock = RLock()
         self._last: tuple[float, Mode] | None = None
         self.configs: dict[Mode, MpcConfig] = {}
-        self.proposals: dict[Mode, KinematicProposal] = {}
         self._planners: dict[Mode, SamplingOptimizer] = {}
         self._noise: dict[Mode, np.ndarray] = {}
         if targets is None:
             targets = split_names(config.targets) or ("head",)
         self.configure(
-            {mode: _override(morphology.mpc_config(mode), config) for mode in Mode},
+            {mode: config.override(morphology.mpc_config(mode)) for mode in Mode},
             targets,
             split_names(config.body),
             frozenset(split_names(config.constraints)),
@@ -150,17 +155,7 @@ class MpcRetargeter(Retargeter):
                 self.command_model.body, self._last = mask, None
             if constraints is not None:
                 self.constraints = constraints
-            self.proposals = {
-                mode: KinematicProposal(
-                    self.rollout.model,
-                    self.command_model,
-                    self.sites,
-                    make_proposal_weights(each.weights, upright=bool(self._find_upright())),
-                    self.support,
-                    self.morphology.base_body,
-                )
-                for mode, each in new.items()
-            }
+            self.candidates.configure(new, self.sites, bool(self._find_upright()))
 
     def _make_noise(self, config: MpcConfig) -> np.ndarray:
         """Standard deviation of every entry; a misspelt name must not mean no noise. (n,)."""
@@ -192,7 +187,7 @@ class MpcRetargeter(Retargeter):
         with self._lock:
             self._rng = np.random.default_rng(self._seed)
             self._last = None
-            self._direct = None
+            self.candidates.reset()
             self.drift.reset()
             self.offset.reset(self.decision.join(state.command, state.arms))
             for planner in self._planners.values():
@@ -217,16 +212,30 @@ class MpcRetargeter(Retargeter):
         poses = self.readings.compute_poses(state.qpos, self.sites)
         goal = hold_near(goal, poses, config.reach)
         goal = hold_level(goal, self._find_upright())
-        facing = self._compute_facing(state, poses, goal, config)
-        proposal = self._propose(state, goal, executed, held, drift, facing, config)
-        candidates = self._collect_candidates(state, goal, executed, proposal, config)
+        then = self._preview(goal, config.proposal_s, config)
+        facing = np.zeros(2)
+        if self.command_model.is_nonholonomic and mode is Mode.MOBILE:
+            facing = self._facing.compute(state.qpos, poses, then, config.proposal_s)
+        proposal = self.candidates.propose(
+            state,
+            then,
+            mode,
+            config,
+            start=planner.commands[0],
+            executed=executed,
+            drift=drift,
+            facing=facing,
+        )
+        proposal = np.where(acting, proposal, held)
+        candidates = self.candidates.collect(state, goal, executed, proposal, config)
         candidates = np.where(acting, candidates, held)
         noise = self._noise[mode] * acting * self._compute_noise_share(poses, goal, config)
         samples = planner.sample(self._rng, noise, candidates)
         commands = self.space.restrict(np.where(acting, samples.commands, held), mode)
         sampled = perf_counter()
 
-        prediction = self._predict(state, self._limit_rates(executed, commands, mode), mode)
+        limited = self.command_model.limit_rates(executed, commands, mode, POLICY_DT)
+        prediction = self._predict(state, limited, mode)
         rolled = perf_counter()
         with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
             evaluation = self._evaluate(
@@ -288,93 +297,10 @@ class MpcRetargeter(Retargeter):
         else:
             planner.shift(max(0.0, time - self._last[0]) / POLICY_DT)
 
-    def _compute_facing(
-        self, state: RobotState, poses: Mapping[str, np.ndarray], goal: Goal, config: MpcConfig
-    ) -> np.ndarray:
-        """Where a base on wheels shall face, to drive after the first target. Shape (2,).
-
-        A hand looks nowhere: for it the base may face as it does.
-        """
-        if not self.command_model.is_nonholonomic or goal.mode is not Mode.MOBILE:
-            return np.zeros(2)
-        heading, pivot = float(quat_yaw(state.qpos[3:7])), self.command_model.pivot
-        hands = {arm.frame for arm in self.morphology.arms}
-        for name, then in self._preview(goal, config.proposal_s, config).items():
-            missing = then[0, :2] - poses[name][:2]
-            velocity, look = missing / config.proposal_s, heading
-            if name not in hands:
-                look = float(quat_yaw(then[0, 3:]))
-                end = then[0, :2] + (pivot - self._resting[name]) * _direction(look)
-                velocity = (end - state.qpos[:2] - pivot * _direction(heading)) / config.proposal_s
-            speed = float(np.hypot(*missing)) / config.proposal_s
-            return compute_facing(heading, velocity, look, speed)
-        return np.zeros(2)
-
     def _preview(
         self, goal: Goal, ahead: float | np.ndarray, config: MpcConfig
     ) -> dict[str, np.ndarray]:
         return preview(goal, self.frames, np.atleast_1d(ahead), config.preview_s)
-
-    def _propose(
-        self,
-        state: RobotState,
-        goal: Goal,
-        executed: np.ndarray,
-        held: np.ndarray,
-        drift: np.ndarray,
-        facing: np.ndarray,
-        config: MpcConfig,
-    ) -> np.ndarray:
-        """The kinematic proposal, or the executed command where there is none. Shape (n,)."""
-        if "proposal" not in config.candidates and config.control_reference != "proposal":
-            return executed
-        then = self._preview(goal, config.proposal_s, config)
-        proposal = self.proposals[goal.mode].solve(
-            state.qpos,
-            {name: poses[0] for name, poses in then.items()},
-            goal.mode,
-            config.proposal_s,
-            start=self._planners[goal.mode].commands[0],
-            drift=drift,
-            executed=executed,
-            offset=self.offset.offset,
-            settled=self.offset.settled,
-            facing=facing,
-        )
-        if not np.isfinite(proposal).all():
-            return executed
-        return np.where(self.command_model.acting(goal.mode), proposal, held)
-
-    def _collect_candidates(
-        self,
-        state: RobotState,
-        goal: Goal,
-        executed: np.ndarray,
-        proposal: np.ndarray,
-        config: MpcConfig,
-    ) -> np.ndarray:
-        """The fixed commands to try. Shape (c, n)."""
-        candidates = []
-        for name in config.candidates:
-            if name == "proposal":
-                candidates.append(proposal)
-            elif name == "paced":
-                rates = self.space.compute_max_rate(goal.mode, executed)
-                candidates.append(pace(executed, proposal, rates * 2 / config.control_hz))
-            elif name == "direct":
-                command = self._map_directly(state, goal)
-                candidates.append(self.decision.join(command, state.arms))
-            elif name == "previous":
-                candidates.append(executed)
-            else:
-                candidates.append(np.where(self.command_model.is_velocity(), 0.0, executed))
-        return np.array(candidates).reshape(-1, len(self.space))
-
-    def _map_directly(self, state: RobotState, goal: Goal) -> np.ndarray:
-        if self._direct is None:
-            self._direct = DirectRetargeter(self.morphology, self.rollout.model)
-            self._direct.reset(state)
-        return self._direct.plan(state, goal).command
 
     def _compute_noise_share(
         self, poses: Mapping[str, np.ndarray], goal: Goal, config: MpcConfig
@@ -387,32 +313,13 @@ class MpcRetargeter(Retargeter):
             error = max(error, math.dist(poses[name][:3], goals[0, :3]), math.acos(cosine))
         return float(np.clip(error / config.full_noise_error, config.min_noise, 1.0))
 
-    def _limit_rates(self, executed: np.ndarray, commands: np.ndarray, mode: Mode) -> np.ndarray:
-        """What the robot will make of command sequences. Shapes (n,), (K, H, n)."""
-        step = self.space.compute_max_rate(mode, executed) * POLICY_DT
-        horizon = commands.shape[1]
-        if (commands == commands[:, :1]).all():  # a command that is held is approached straight
-            reach = step * np.arange(1, horizon + 1)[:, None]
-            return np.clip(commands, executed - reach, executed + reach)
-        limited = np.empty_like(commands)
-        for k in range(horizon):
-            executed = np.clip(commands[:, k], executed - step, executed + step)
-            limited[:, k] = executed
-        return limited
-
     def _predict(self, state: RobotState, decisions: np.ndarray, mode: Mode) -> Prediction:
-        """Roll decisions out; grippers stay as they are. Shape (K, H, n)."""
-        count = self.decision.num_commands
-        arms = state.arms
-        if self.command_model.body[count:].any():
-            grippers = np.broadcast_to(
-                arms[len(self.decision.joints) :],
-                (*decisions.shape[:2], len(arms) - len(self.decision.joints)),
-            )
-            arms = np.concatenate([decisions[..., count:], grippers], axis=-1)
-        return self.rollout.predict(
-            state.qpos, state.qvel, state.memory, decisions[..., :count], arms, mode
-        )._replace(commands=decisions)
+        """Roll decisions out. Shape (K, H, n)."""
+        commands, arms = self.decision.split(decisions, state.arms, self.command_model.body)
+        prediction = self.rollout.predict(
+            state.qpos, state.qvel, state.memory, commands, arms, mode
+        )
+        return prediction._replace(commands=decisions)
 
     def _evaluate(
         self,
@@ -493,18 +400,3 @@ class MpcRetargeter(Retargeter):
 
 def _finite(value: float) -> float:
     return float(value) if math.isfinite(value) else 0.0
-
-
-def _override(config: MpcConfig, settings: RetargeterConfig) -> MpcConfig:
-    """Apply what the user set; zeros leave the robot's own parameter."""
-    wanted = {
-        name: getattr(settings, name)
-        for name in ("num_samples", "horizon", "control_hz")
-        if getattr(settings, name)
-    }
-    return replace(config, **wanted)
-
-
-def _direction(heading: float) -> np.ndarray:
-    """Unit vector of a heading. Shape (2,)."""
-    return np.array([np.cos(heading), np.sin(heading)])

@@ -133,15 +133,10 @@ def build_configs(
     """
     settings = settings or make_settings(morphology, config)
     variant = morphology.variants[settings.variant]
-    numbers = {
-        name: getattr(config, name)
-        for name in ("num_samples", "horizon", "control_hz")
-        if getattr(config, name)
-    }
     configs = {}
     for mode in Mode:
         own = variant.configs.get(mode) or morphology.mpc_config(mode)
         made = _MAKERS[settings.preset](morphology, own, variant.paper[mode])
         weights = dataclasses.replace(made.weights, **settings.weights)
-        configs[mode] = dataclasses.replace(made, weights=weights, **numbers)
+        configs[mode] = config.override(dataclasses.replace(made, weights=weights))
     return configs

@@ -1,0 +1,144 @@
+"""Fixed commands that are tried beside the samples, the kinematic proposal first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.retarget.costs.support import SupportArea
+from xop_lerobot.retarget.decision import DecisionSpace
+from xop_lerobot.retarget.direct import DirectRetargeter
+from xop_lerobot.retarget.offset import OffsetObserver
+from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights, pace
+from xop_lerobot.state import Goal, RobotState
+
+
+class Candidates:
+    """Makes the commands that `MpcConfig.candidates` names.
+
+    Args:
+        morphology: The robot.
+        model: Its planning model.
+        decision: What is decided.
+        command_model: What a decision does.
+        offset: Where the robot rests beside its command.
+        support: Area over which the centre of mass stays, None for a robot that balances itself.
+
+    Attributes:
+        proposals: The kinematic proposal of each mode.
+    """
+
+    def __init__(
+        self,
+        morphology: Morphology,
+        model: mujoco.MjModel,
+        decision: DecisionSpace,
+        command_model: CommandModel,
+        offset: OffsetObserver,
+        support: SupportArea | None,
+    ) -> None:
+        self._morphology, self._model, self._support = morphology, model, support
+        self._decision, self._command_model, self._offset = decision, command_model, offset
+        self._direct: DirectRetargeter | None = None
+        self.proposals: dict[Mode, KinematicProposal] = {}
+
+    def configure(
+        self, configs: Mapping[Mode, MpcConfig], sites: Mapping[str, str], upright: bool
+    ) -> None:
+        """Take other parameters, or other targets with their sites."""
+        self.proposals = {
+            mode: KinematicProposal(
+                self._model,
+                self._command_model,
+                sites,
+                make_proposal_weights(config.weights, upright=upright),
+                self._support,
+                self._morphology.base_body,
+            )
+            for mode, config in configs.items()
+        }
+
+    def reset(self) -> None:
+        """Forget what was mapped directly before."""
+        self._direct = None
+
+    def propose(
+        self,
+        state: RobotState,
+        then: Mapping[str, np.ndarray],
+        mode: Mode,
+        config: MpcConfig,
+        *,
+        start: np.ndarray,
+        executed: np.ndarray,
+        drift: np.ndarray,
+        facing: np.ndarray,
+    ) -> np.ndarray:
+        """Compute the kinematic proposal, or the executed command where it is not asked for.
+
+        Args:
+            state: The robot now.
+            then: Goal of each target in `config.proposal_s`. Shapes (1, 7).
+            mode: Mode of the robot.
+            config: Parameters of the mode.
+            start: Decision from which the iteration starts. Shape (n,).
+            executed: Decision being executed. Shape (n,).
+            drift: Drift of the base. Shape (3,).
+            facing: Where a base on wheels shall face. Shape (2,).
+
+        Returns:
+            Decision. Shape (n,).
+        """
+        if "proposal" not in config.candidates and config.control_reference != "proposal":
+            return executed
+        proposal = self.proposals[mode].solve(
+            state.qpos,
+            {name: poses[0] for name, poses in then.items()},
+            mode,
+            config.proposal_s,
+            start=start,
+            drift=drift,
+            executed=executed,
+            offset=self._offset.offset,
+            settled=self._offset.settled,
+            facing=facing,
+        )
+        return proposal if np.isfinite(proposal).all() else executed
+
+    def collect(
+        self,
+        state: RobotState,
+        goal: Goal,
+        executed: np.ndarray,
+        proposal: np.ndarray,
+        config: MpcConfig,
+    ) -> np.ndarray:
+        """All fixed decisions to try, in the order of `config.candidates`. Shape (c, n)."""
+        candidates = []
+        space = self._decision.space
+        for name in config.candidates:
+            if name == "proposal":
+                candidates.append(proposal)
+            elif name == "paced":
+                rates = space.compute_max_rate(goal.mode, executed)
+                candidates.append(pace(executed, proposal, rates * 2 / config.control_hz))
+            elif name == "direct":
+                candidates.append(self._decision.join(self._map(state, goal), state.arms))
+            elif name == "previous":
+                candidates.append(executed)
+            else:
+                candidates.append(np.where(self._command_model.is_velocity(), 0.0, executed))
+        return np.array(candidates).reshape(-1, len(space))
+
+    def _map(self, state: RobotState, goal: Goal) -> np.ndarray:
+        """The direct mapping's command. Shape (k,)."""
+        if self._direct is None:
+            self._direct = DirectRetargeter(self._morphology, self._model)
+            self._direct.reset(state)
+        return self._direct.plan(state, goal).command
