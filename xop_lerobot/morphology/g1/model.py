@@ -54,7 +54,7 @@ def build_g1(kind: str) -> mujoco.MjSpec:
     """Build G1 alone.
 
     The planning model has the feet's contact spheres alone, which meet the floor and nothing
-    else, no dry friction (29 constraint rows less), no visuals, no cameras, no sensors.
+    else, no dry friction (29 constraint rows less), no visuals, no cameras.
 
     Args:
         kind: ``"full"`` or ``"planning"``.

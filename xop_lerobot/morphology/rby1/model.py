@@ -70,7 +70,7 @@ def build_rby1(kind: str) -> mujoco.MjSpec:
     """Build RB-Y1 alone.
 
     The planning model has wheels and casters alone, which meet the floor, no visuals, no
-    cameras, no sensors.
+    cameras.
 
     Args:
         kind: ``"full"`` or ``"planning"``.
