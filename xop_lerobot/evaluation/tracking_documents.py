@@ -120,7 +120,7 @@ def make_blocks(runs: Mapping[str, Run], machine: Mapping[str, Any]) -> dict[str
     """Tables by the name of their markers; those without a run are left as they are.
 
     Tables of scenarios take the runs with the longest hold, tables of variants those that were
-    held as long as the variants.
+    held as long as the variants, of the same scenarios and seeds.
     """
     blocks = {"machine": describe_conditions(runs, machine)}
     for robot in ROBOTS:
@@ -141,14 +141,28 @@ def make_blocks(runs: Mapping[str, Run], machine: Mapping[str, Any]) -> dict[str
                     others = [run for run in own.values() if run["ablation"] in variants]
                     holds = {run["hold"] for run in others if run["ablation"] != "default"}
                     if holds:
+                        alike = _keep_alike(_keep_holds(own, holds), variants)
                         blocks[f"{robot} {kind} {suffix}"] = make_ablation_table(
-                            _keep_holds(own, holds), robot, names, variants
+                            alike, robot, names, variants
                         )
     return blocks
 
 
 def _keep_holds(runs: Mapping[str, Run], holds: Collection[float]) -> dict[str, Run]:
     return {key: run for key, run in runs.items() if run["hold"] in holds}
+
+
+def _keep_alike(runs: Mapping[str, Run], variants: Collection[str]) -> dict[str, Run]:
+    """Keep the default's runs of those scenarios and seeds that a variant was run with too.
+
+    Rows of one table are compared: they must not be over different goals.
+    """
+    ran = {
+        (run["scenario"], run["seed"])
+        for run in runs.values()
+        if run["ablation"] in variants and run["ablation"] != "default"
+    }
+    return {key: run for key, run in runs.items() if (run["scenario"], run["seed"]) in ran}
 
 
 def describe_conditions(runs: Mapping[str, Run], machine: Mapping[str, Any]) -> str:
