@@ -227,7 +227,7 @@ def test_the_nearer_a_wall_the_more_is_done(driver):
     """The reason and the risk are in `Plan.health`, and the velocity is what they say."""
     free = driver.plan(5.0)
     assert free.health == {"intervention": Intervention.NONE, "risk": 0.0}
-    distances = np.linspace(0.02, 0.3, 29)
+    distances = np.linspace(0.02, 0.5, 33)
     plans = [driver.plan(distance) for distance in distances]
     risks = [plan.health["risk"] for plan in plans]
     assert (np.diff(risks) <= 1e-12).all()
