@@ -264,6 +264,18 @@ def test_a_goal_without_a_bound_frame_is_no_motion(bench):
     np.testing.assert_allclose(plan.command[:2], 0, atol=0.1)
 
 
+def test_without_the_observers_nothing_that_they_knew_is_left(bench):
+    """A preset without them, in mid-episode, must not plan with what was true before."""
+    retargeter, goal = bench.retargeter, bench.make_goal((0.3, 0, 0))
+    for _ in range(10):
+        bench.tick(goal)
+    assert retargeter.drift.drift.any()
+    retargeter.configure(bench.replace(observe_drift=False))
+    bench.tick(goal)
+    np.testing.assert_array_equal(retargeter.drift.drift, 0)
+    np.testing.assert_array_equal(retargeter.offset.offset, 0)
+
+
 # -- from other threads ----------------------------------------------------------------------
 
 

@@ -46,8 +46,8 @@ class Parts:
         qpos[self.model._address[follows]] = values[follows]
         return qpos
 
-    def update(self, values: np.ndarray, command: np.ndarray) -> None:
-        self.observer.update(self.time, self.place(values), command)
+    def update(self, values: np.ndarray, command: np.ndarray, learns: bool = True) -> None:
+        self.observer.update(self.time, self.place(values), command, learns=learns)
         self.time += DT
 
 
@@ -116,6 +116,19 @@ def test_each_entry_learns_on_its_own(parts):
         parts.update(parts.space.neutral + [-0.01, 0.3, 0, 0, 0, 0, 0], command)
     assert parts.observer.offset[0] == pytest.approx(-0.01, rel=0.05)
     assert parts.observer.offset[1] == 0
+
+
+def test_told_not_to_learn_it_forgets_but_follows_the_command(parts):
+    """The lagged command is where a sway starts from, with offsets or without."""
+    command = parts.space.neutral.copy()
+    for _ in range(50):
+        parts.update(command + BESIDE, command)
+    assert parts.observer.offset.any()
+    command[4] = 0.1
+    for _ in range(100):
+        parts.update(parts.space.neutral + BESIDE, command, learns=False)
+    np.testing.assert_array_equal(parts.observer.offset, 0)
+    np.testing.assert_allclose(parts.observer.settled, command, atol=1e-3)
 
 
 def test_an_offset_is_bounded(parts):

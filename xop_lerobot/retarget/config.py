@@ -102,7 +102,8 @@ class MpcConfig:
             `previous` command, which is still executed; and `stop`.
         control_reference: Command from which the control cost counts: the `proposal`, `neutral`,
             or `zero` as in the paper.
-        observe_drift: Whether a steady drift of a walking base is observed and counted on.
+        observe_drift: Whether a steady drift of a walking base, and where height and joints rest
+            beside their command, are observed and counted on.
         weights: Cost weights.
     """
 

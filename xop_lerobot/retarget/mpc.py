@@ -205,9 +205,9 @@ class MpcRetargeter(Retargeter):
         acting = self.command_model.acting(mode)
         held = self._compute_held(executed, mode)
         self._warm_start(np.where(acting, executed, held), state.time, mode)
-        if config.observe_drift:
-            self.drift.update(state.time, state.qpos, executed, mode is Mode.MOBILE)
-            self.offset.update(state.time, state.qpos, executed)
+        observes = config.observe_drift
+        self.drift.update(state.time, state.qpos, executed, observes and mode is Mode.MOBILE)
+        self.offset.update(state.time, state.qpos, executed, learns=observes)
         drift = self.drift.drift
         poses = self.readings.compute_poses(state.qpos, self.sites)
         goal = hold_near(goal, poses, config.reach)

@@ -42,17 +42,29 @@ class OffsetObserver:
         self.offset = np.zeros(len(self.settled))
         self._last: float | None = None
 
-    def update(self, time: float, qpos: np.ndarray, command: np.ndarray) -> None:
-        """Take the configuration at `time` [s] and the command executed since the last one."""
+    def update(
+        self, time: float, qpos: np.ndarray, command: np.ndarray, *, learns: bool = True
+    ) -> None:
+        """Take what has happened since the last call.
+
+        Args:
+            time: The robot's clock [s].
+            qpos: Configuration. Shape (nq,).
+            command: Command executed since then. Shape (k,).
+            learns: Whether offsets are counted on; if not, they are forgotten.
+        """
         last, self._last = self._last, time
         if last is None or time <= last:
             return
         dt = time - last
         model = self.command_model
         self.settled = model.settle(self.settled, command, dt)
+        if not learns:
+            self.offset = np.zeros(len(self.settled))
+            return
         beside = model.read(qpos) - self.settled - self.offset
         quiet = np.abs(command - self.settled) < _QUIET * self._scale
-        learns = quiet & ~model.is_velocity() & np.isfinite(beside)
+        known = quiet & ~model.is_velocity() & np.isfinite(beside)
         gain = -np.expm1(-dt / self.time_constant)
-        moved = self.offset + gain * np.where(learns, beside, 0.0)
+        moved = self.offset + gain * np.where(known, beside, 0.0)
         self.offset = np.clip(moved, -_MAX * self._scale, _MAX * self._scale)
