@@ -8,13 +8,9 @@ import numpy as np
 
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arm_bias import ArmBias
-from xop_lerobot.retarget.arm_ik import ArmIk
+from xop_lerobot.retarget.arm_ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
 from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
 from xop_lerobot.state import FRAMES, Goal, RobotState
-
-ARM_SPEED = 3.0
-"""Largest speed of arm targets that a plan decides, as of the inverse kinematics [rad/s]."""
-_MAX_DT = 0.05  # a tick that comes late counts as so much [s]
 
 
 class ArmDriver:
@@ -74,7 +70,7 @@ class ArmDriver:
         planned = np.zeros(num_joints, dtype=bool)
         for name, angle in decided.items():
             i = self._joints.index(name)
-            reach = ARM_SPEED * min(dt, _MAX_DT)
+            reach = ARM_MAX_RATE * min(dt, ARM_MAX_DT)
             wanted[i] = np.clip(angle, executed[i] - reach, executed[i] + reach)
             planned[i] = True
         self._wanted = wanted

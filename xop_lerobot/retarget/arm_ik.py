@@ -10,7 +10,10 @@ import numpy as np
 
 from xop_lerobot.morphology.morphology import Morphology
 
-_MAX_DT = 0.05  # after a stall the arms move as after one late tick, not all at once
+ARM_MAX_RATE = 3.0
+"""Largest speed of arm targets, whoever decides them [rad/s]."""
+ARM_MAX_DT = 0.05
+"""After a stall the arms move as after one late tick, not all at once [s]."""
 
 
 class ArmIk:
@@ -33,7 +36,7 @@ class ArmIk:
     def __init__(
         self,
         morphology: Morphology,
-        max_speed: float = 3.0,
+        max_speed: float = ARM_MAX_RATE,
         iterations: int = 2,
     ) -> None:
         self.iterations = iterations
@@ -117,7 +120,7 @@ class ArmIk:
         rest[self.qpos_address] = self._rest
         self._posture.set_target(rest)
         self._configuration.update(q)
-        step = min(dt, _MAX_DT) / self.iterations
+        step = min(dt, ARM_MAX_DT) / self.iterations
         for _ in range(self.iterations):
             try:
                 velocity = mink.solve_ik(

@@ -8,13 +8,12 @@ import numpy as np
 from xop_lerobot.command import CommandDim, CommandSpace
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.arm_ik import ARM_MAX_RATE
 
 ARM_LAG_S = 0.1
 """Time constant with which arm joints follow their targets, to first order [s]."""
 ARM_EFFORT = 3.0
 """How dear arm joints are to the kinematic proposal, away from their rest: they unwind in time."""
-ARM_MAX_RATE = 3.0
-"""Largest speed of arm targets that the controller plans with, as the arms' IK [rad/s]."""
 
 
 class DecisionSpace:
