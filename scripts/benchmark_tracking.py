@@ -100,7 +100,7 @@ def make_setups(args: argparse.Namespace) -> list[TrackingSetup]:
     scenarios = [name for each in args.scenarios.split(",") for name in GROUPS.get(each, (each,))]
     for name in scenarios:
         if name not in SCENARIOS:
-            raise UnknownName("scenario", name, (*SCENARIOS, *GROUPS))
+            raise UnknownName("scenario", name, {*SCENARIOS, *GROUPS})
     ablations = list(ABLATIONS) if args.ablations == "all" else args.ablations.split(",")
     for name in ablations:
         get_ablation(name)
