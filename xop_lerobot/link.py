@@ -17,6 +17,7 @@ import numpy as np
 
 from xop_lerobot.errors import LinkError
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.view import View
 from xop_lerobot.state import Goal, RobotState
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ class Session:
         state: State that the robot published last.
         tick: Record of the teleoperator's last tick.
         outcome: Outcome of the task after the last action, None where no task runs.
+        view: What a person could see of the robot and its task now, None where no task runs.
         episode: Index of the episode being recorded; the robot's seed depends on it.
         reset_count: Number of robot resets so far; a change tells the teleoperator to re-align.
         configs: Resolved configuration of each part (`robot`, `teleop`), saved with a dataset.
@@ -118,6 +120,7 @@ class Session:
         self.state: RobotState | None = None
         self.tick: TickRecord | None = None
         self.outcome: Outcome | None = None
+        self.view: View | None = None
         self.episode = 0
         self.reset_count = 0
         self.configs: dict[str, Any] = {}
@@ -133,7 +136,7 @@ class Session:
         with self._lock:
             self._robots = [known for known in self._robots if known is not info]
             if not self._robots:
-                self.state = self.tick = self.outcome = None
+                self.state = self.tick = self.outcome = self.view = None
                 self.episode, self._reset_asked = 0, False
 
     def begin_episode(self, index: int) -> None:
@@ -148,7 +151,7 @@ class Session:
 
     def confirm_reset(self) -> None:
         """Count a reset that the robot has done, and forget what was before it."""
-        self.state = self.tick = self.outcome = None
+        self.state = self.tick = self.outcome = self.view = None
         self.reset_count += 1
 
     @property

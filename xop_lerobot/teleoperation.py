@@ -20,6 +20,7 @@ from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import Gesture, GestureConfig, GestureReader, grip_from_pinch
 from xop_lerobot.operator.goal_velocity import GoalVelocity
+from xop_lerobot.operator.view import View
 from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.retarget.arm_driver import ArmDriver
 from xop_lerobot.retarget.changes import Change, Settings, make_toggle, parse_change
@@ -120,6 +121,11 @@ class Teleoperation:
     def reset(self) -> None:
         """Start over, as after a reset of the robot: nobody is engaged, no plan is known."""
         self._start_over()
+
+    def see(self, view: View | None) -> None:
+        """Show the operator the robot and its task, before `step`; None where no task runs."""
+        if view is not None:
+            self.device.see(dataclasses.replace(view, engaged=self.alignment.is_engaged))
 
     def change(self, change: Change | Mapping[str, Any], source: str = "call") -> dict[str, Any]:
         """Ask for other settings, from any thread; they hold from the next `step` on.

@@ -198,6 +198,7 @@ class Xop(Teleoperator):
         if self._session.reset_count != self._resets_seen:
             self._resets_seen = self._session.reset_count
             self._teleoperation.reset()
+        self._teleoperation.see(self._session.view)
         action, self._session.tick = self._teleoperation.step(state)
         return info.morphology.layout.to_dict(action)
 

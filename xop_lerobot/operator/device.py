@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 
 from xop_lerobot.command import Mode
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.view import View
 
 
 class Device(ABC):
@@ -37,3 +38,7 @@ class Device(ABC):
         """Whether a recording or script has played out at `time`; people never finish."""
         del time
         return False
+
+    def see(self, view: View) -> None:
+        """Look at the robot and what is about it; only a simulated person needs to."""
+        del view

@@ -1,0 +1,1 @@
+"""Tasks by name: `make_task("box_pick_and_place", make_morphology("g1"))`."""

@@ -1,0 +1,90 @@
+"""The interface of a task, and the registry of tasks."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from xop_lerobot.link import Outcome
+from xop_lerobot.operator.view import SeenObject
+from xop_lerobot.registry import Registry
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from xop_lerobot.morphology.morphology import Morphology
+    from xop_lerobot.plant.simulation import Simulation
+
+
+@dataclass(frozen=True)
+class TaskStatus(Outcome):
+    """How far an episode is, decided by the physics alone.
+
+    Attributes:
+        failure: Why the episode is lost, in words; empty while it is not.
+        picked_up: Whether the object was held up for long enough.
+        figures: Further figures of the episode by name, fit for JSON.
+    """
+
+    failure: str = ""
+    picked_up: bool = False
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+
+class Task(ABC):
+    """Something to do: furniture and objects about a robot, and what counts as having done it.
+
+    `add_to` puts everything into the robot's full model, `bind` finds it again in the compiled
+    one, `reset` places it at random, and `update` looks at the physics after every control step.
+
+    Args:
+        morphology: The robot that has to do it; sizes and places are made for its reach.
+    """
+
+    name: ClassVar[str]
+    instruction: ClassVar[str]
+    """What is to be done, in words; LeRobot's `task` of every frame."""
+    time_limit: ClassVar[float]
+    """Time after which an episode is over [s]."""
+    scenes: ClassVar[Mapping[str, str]] = {"g1": "empty", "rby1": "room"}
+    """Scene by robot, where none is asked for."""
+
+    def __init__(self, morphology: Morphology) -> None:
+        self.morphology = morphology
+
+    @abstractmethod
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add furniture and objects to the model of a robot in a scene."""
+
+    @abstractmethod
+    def bind(self, plant: Simulation) -> None:
+        """Find what `add_to` added in the compiled model of `plant`."""
+
+    @abstractmethod
+    def reset(self, rng: np.random.Generator) -> None:
+        """Place everything anew, with the robot at its start; the same draw, the same places."""
+
+    @abstractmethod
+    def update(self) -> TaskStatus:
+        """Look at the physics, once per control step, and tell how far the episode is."""
+
+    @property
+    @abstractmethod
+    def objects(self) -> Mapping[str, SeenObject]:
+        """What a person can see of the task, by name."""
+
+
+TASKS: Registry[type[Task]] = Registry("task")
+
+
+def make_task(name: str, morphology: Morphology) -> Task:
+    """Make the task `name` for a robot.
+
+    Raises:
+        UnknownName: Listing the known tasks.
+    """
+    return TASKS[name](morphology)
