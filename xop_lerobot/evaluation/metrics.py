@@ -1,0 +1,233 @@
+r"""The paper's figures of one trial, and some more: pure functions of arrays.
+
+Arrays have one row for each tick of the control loop, `n` in all. What a figure would be an
+average of may never have come (no tick in standing mode, no goal); the figure is nan then.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from xop_lerobot.errors import BadShape, BadValue
+from xop_lerobot.transforms import quat_rotate, rotation_error
+
+JERK_WINDOW_S = 0.24
+"""Length of the filter under which jerk is computed [s]."""
+JERK_ORDER = 3
+"""Order of the filter's polynomial."""
+NEVER = float("nan")
+"""What a figure is that no tick contributed to."""
+
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+class BalancePower(NamedTuple):
+    """Average power of the lower body while it stands.
+
+    Attributes:
+        absolute: With every joint's power as a magnitude, the paper's ABP [W].
+        signed: With braking as negative power [W].
+    """
+
+    absolute: float
+    signed: float
+
+
+class TrackingError(NamedTuple):
+    """Distance of a frame of the robot from its goal.
+
+    Attributes:
+        position: Mean distance [m].
+        position_p95: 95th percentile of the distance [m].
+        angle: Mean angle of the rotation to the goal [rad].
+    """
+
+    position: float
+    position_p95: float
+    angle: float
+
+
+def compute_balance_power(
+    effort: np.ndarray, velocity: np.ndarray, standing: np.ndarray
+) -> BalancePower:
+    r"""Compute :math:`\text{ABP} = \frac1K\sum_{k=1}^K\frac1m\sum_{l=1}^m P_l(t_k)`.
+
+    K are the ticks in standing mode, m the joints of the lower body. The paper's motor power
+    :math:`P_l = \tau_l\dot q_l` is taken as a magnitude, :math:`|\tau_l\dot q_l|`: a motor that
+    brakes works too, and over a whole squat the signed power would cancel out.
+
+    Args:
+        effort: Torque of each joint of the lower body [N m]. Shape (n, m).
+        velocity: Velocity of each of them [rad/s]. Shape (n, m).
+        standing: Whether the robot is in standing mode. Shape (n,), bool.
+
+    Returns:
+        Average power of a joint [W], nan if the robot never stands.
+
+    Raises:
+        BadShape: If the shapes do not fit.
+    """
+    if effort.ndim != 2 or velocity.shape != effort.shape:  # noqa: PLR2004
+        raise BadShape("velocity", effort.shape, velocity.shape)
+    _check_rows("standing", standing, len(effort))
+    power = (effort * velocity)[np.asarray(standing, bool)]
+    if not power.size:
+        return BalancePower(NEVER, NEVER)
+    return BalancePower(float(np.abs(power).mean()), float(power.mean()))
+
+
+def compute_jerk(
+    position: np.ndarray,
+    dt: float,
+    chosen: np.ndarray | None = None,
+    window_s: float = JERK_WINDOW_S,
+) -> float:
+    r"""Compute the mean jerk :math:`\frac1n\sum_k\lVert\dddot p(t_k)\rVert` [m/s³].
+
+    The third derivative is that of a Savitzky-Golay filter: a cubic fitted by least squares to
+    `window_s` about each tick (7 points at 25 Hz). Motion up to about 4 Hz passes, which is all
+    that a hand does; the bare third difference would tell of rounding and of the rate.
+
+    Args:
+        position: Position of a point [m]. Shape (n, 3).
+        dt: Time between ticks [s].
+        chosen: Ticks that count, all where None; the filter never reaches beyond a run of them.
+            Shape (n,), bool.
+        window_s: Length of the filter [s].
+
+    Returns:
+        Jerk, nan if no run of chosen ticks is as long as the filter.
+
+    Raises:
+        BadShape: If the shapes do not fit.
+        BadValue: If the filter has fewer points than its polynomial needs.
+    """
+    if position.ndim != 2 or position.shape[1] != 3:  # noqa: PLR2004
+        raise BadShape("position", ("n", 3), position.shape)
+    size = 2 * round(window_s / dt / 2) + 1
+    if size <= JERK_ORDER:
+        raise BadValue(
+            f"a filter of {window_s} s has {size} points at {1 / dt:g} Hz, "
+            f"it needs {JERK_ORDER + 1} or more"
+        )
+    chosen = np.ones(len(position), bool) if chosen is None else np.asarray(chosen, bool)
+    _check_rows("chosen", chosen, len(position))
+    jerks = [
+        savgol_filter(position[first:last], size, JERK_ORDER, deriv=3, delta=dt, axis=0)
+        for first, last in find_runs(chosen)
+        if last - first >= size
+    ]
+    if not jerks:
+        return NEVER
+    return float(np.linalg.norm(np.concatenate(jerks), axis=1).mean())
+
+
+def compute_tilt(quat: np.ndarray, chosen: np.ndarray | None = None) -> float:
+    r"""Compute the mean tilt :math:`\frac1n\sum_k\arccos(s\,e_z^T R(t_k)\,e_z)` of a hand [rad].
+
+    The Z of a wrist points out of the back of the hand. s is the side that is up in the first
+    of the ticks: 1 for the back, -1 for the palm, so that a hand that turns over counts as π.
+
+    Args:
+        quat: Orientation of the wrist, wxyz. Shape (n, 4).
+        chosen: Ticks that count, all where None. Shape (n,), bool.
+
+    Returns:
+        Tilt, nan if no tick is chosen.
+    """
+    cosine = quat_rotate(quat, _UP)[:, 2]
+    if chosen is not None:
+        _check_rows("chosen", chosen, len(quat))
+        cosine = cosine[np.asarray(chosen, bool)]
+    if not cosine.size:
+        return NEVER
+    side = 1.0 if cosine[0] >= 0 else -1.0
+    return float(np.arccos(np.clip(side * cosine, -1, 1)).mean())
+
+
+def compute_tracking_error(pose: np.ndarray, goal: np.ndarray) -> TrackingError:
+    r"""Compute :math:`\lVert p - p^*\rVert` and :math:`\lVert\log(R^* R^T)\rVert`, averaged.
+
+    Args:
+        pose: True pose of a frame, x y z qw qx qy qz. Shape (n, 7).
+        goal: Its goal; nan in ticks without one, which do not count. Shape (n, 7).
+    """
+    if goal.shape != pose.shape:
+        raise BadShape("goal", pose.shape, goal.shape)
+    known = np.isfinite(goal).all(axis=1)
+    if not known.any():
+        return TrackingError(NEVER, NEVER, NEVER)
+    distance = np.linalg.norm(pose[known, :3] - goal[known, :3], axis=1)
+    angle = np.linalg.norm(rotation_error(goal[known, 3:], pose[known, 3:]), axis=1)
+    return TrackingError(
+        float(distance.mean()), float(np.percentile(distance, 95)), float(angle.mean())
+    )
+
+
+def compute_roughness(command: np.ndarray, half_range: np.ndarray, dt: float) -> float:
+    r"""Compute how rough commands are: :math:`\sqrt{\overline{(\ddot a_i / \hat a_i)^2}}` [1/s²].
+
+    The second difference :math:`\ddot a_i = (a_{n} - 2a_{n-1} + a_{n-2})/dt^2` of each entry is
+    over half its range :math:`\hat a_i`, and the mean is over entries and ticks.
+
+    Args:
+        command: Executed commands. Shape (n, k).
+        half_range: Half the range of each entry. Shape (k,).
+        dt: Time between ticks [s].
+
+    Returns:
+        Roughness, nan with fewer than three ticks.
+    """
+    if half_range.shape != command.shape[1:]:
+        raise BadShape("half_range", command.shape[1:], half_range.shape)
+    if len(command) < 3:  # noqa: PLR2004
+        return NEVER
+    bends = np.diff(command, n=2, axis=0) / (dt * dt) / half_range
+    return float(np.sqrt(np.square(bends).mean()))
+
+
+def compute_slip(feet: np.ndarray, dt: float, height: float = 0.01) -> float:
+    r"""Compute how fast feet slide while they bear: mean of :math:`\lVert v_{xy}\rVert` [m/s].
+
+    A foot bears in a tick if, before it and after it, its middle is within `height` of the
+    lowest place where that foot has been.
+
+    Args:
+        feet: Middle of each foot [m]. Shape (n, f, 3).
+        dt: Time between ticks [s].
+        height: How far over its lowest place a foot still bears [m].
+
+    Returns:
+        Speed, nan if no foot ever bears for two ticks.
+    """
+    if feet.ndim != 3 or not feet.size:  # noqa: PLR2004
+        return NEVER
+    low = feet[..., 2] < feet[..., 2].min(axis=0) + height
+    bears = low[1:] & low[:-1]
+    speed = np.linalg.norm(np.diff(feet[..., :2], axis=0), axis=-1) / dt
+    return float(speed[bears].mean()) if bears.any() else NEVER
+
+
+def compute_longest_hold(within: np.ndarray, dt: float) -> float:
+    """Compute the longest time for which `within` held without a break [s].
+
+    A run of k ticks spans k - 1 periods. It tells a touch (both hands within 5 cm for 3 s) from
+    trajectories alone, as a check on the physics' own verdict.
+    """
+    runs = find_runs(np.asarray(within, bool))
+    return max(((last - first - 1) * dt for first, last in runs), default=0.0)
+
+
+def find_runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Find the runs of true flags, as first tick and the one after the last."""
+    padded = np.concatenate([[False], np.asarray(flags, bool), [False]])
+    edges = np.flatnonzero(padded[1:] != padded[:-1])
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _check_rows(name: str, array: np.ndarray, n: int) -> None:
+    if np.shape(array) != (n,):
+        raise BadShape(name, (n,), np.shape(array))
