@@ -1,0 +1,139 @@
+"""The methods that are compared, and the variants they come in, by name.
+
+A method is a retargeter with a low-level policy. A variant is what a user could also set for it:
+a binding that the robot names, constraints, a preset, with underscores between
+(`v2_upright_conservative`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from xop_lerobot.errors import BadValue, PolicyFileError, UnknownName
+from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method.
+
+    Attributes:
+        title: What it is, for tables.
+        retargeter: Settings of `RetargeterConfig`.
+        low_level: Low-level policy that it always has; empty takes the one that is asked for.
+    """
+
+    title: str
+    retargeter: Mapping[str, Any] = field(default_factory=dict)
+    low_level: str = ""
+
+
+METHODS: dict[str, Method] = {
+    "mpc": Method("MPC retargeter"),
+    "mpc_no_sync": Method("MPC, raw measurements into the planner", {"sync": False}),
+    "mpc_table1": Method("MPC with the paper's Table I", {"preset": "table1"}),
+    "direct": Method("Direct mapping", {"type": "direct"}),
+    "direct_amo": Method("Direct mapping with AMO", {"type": "direct"}, low_level="amo"),
+}
+"""Methods by name."""
+
+
+def get_method(name: str) -> Method:
+    """Look the method `name` up.
+
+    Raises:
+        UnknownName: Listing the known ones.
+    """
+    if name not in METHODS:
+        raise UnknownName("method", name, METHODS)
+    return METHODS[name]
+
+
+def parse_variant(morphology: Morphology, variant: str) -> dict[str, str]:
+    """Read a variant: a binding of the robot, constraints and a preset, in any order.
+
+    Args:
+        morphology: The robot.
+        variant: Names with underscores between; empty for the robot's own defaults.
+
+    Returns:
+        Settings of `RetargeterConfig`.
+
+    Raises:
+        UnknownName: If a part is none of these, listing what is.
+        BadValue: If there are two bindings or two presets.
+    """
+    bindings, constraints, presets = [], [], []
+    for part in variant.split("_") if variant else ():
+        if part in morphology.variants:
+            bindings.append(part)
+        elif part in CONSTRAINTS:
+            constraints.append(part)
+        elif part in PRESETS:
+            presets.append(part)
+        else:
+            known = (*morphology.variants, *CONSTRAINTS, *PRESETS)
+            raise UnknownName(f"part of variant '{variant}' of {morphology.name}", part, known)
+    for what, names in (("bindings", bindings), ("presets", presets)):
+        if len(names) > 1:
+            raise BadValue(f"variant '{variant}' has two {what}: {', '.join(names)}. Choose one")
+    found = {
+        "variant": "".join(bindings),
+        "constraints": ",".join(constraints),
+        "preset": "".join(presets),
+    }
+    return {name: value for name, value in found.items() if value}
+
+
+def make_retargeter_config(
+    morphology: Morphology, method: str, variant: str = "", seed: int = 0
+) -> RetargeterConfig:
+    """Make the retargeter's configuration for one trial, with a single thread.
+
+    Trials run side by side, one to a core: threads of their own would only be in their way.
+
+    Raises:
+        UnknownName: If method or variant are unknown, listing the known ones.
+        BadValue: If the variant contradicts itself or the method.
+    """
+    own = dict(get_method(method).retargeter)
+    added = parse_variant(morphology, variant)
+    twice = own.keys() & added.keys()
+    if twice:
+        raise BadValue(
+            f"method '{method}' sets {', '.join(sorted(twice))} itself; variant '{variant}' "
+            "must not"
+        )
+    return RetargeterConfig(**{"threads": 1, "seed": seed, **own, **added})
+
+
+def resolve_low_level(morphology: Morphology, method: str, low_level: str = "") -> str:
+    """Name of the low-level policy with which `method` runs.
+
+    Args:
+        morphology: The robot.
+        method: Name of the method.
+        low_level: What was asked for; empty for the robot's own.
+
+    Raises:
+        UnknownName: If it does not fit the robot, listing those that do.
+    """
+    name = get_method(method).low_level or low_level or morphology.policies[0]
+    if name not in morphology.policies:
+        if name == "default":
+            return morphology.policies[0]
+        raise UnknownName(f"low-level policy of {morphology.name}", name, morphology.policies)
+    return name
+
+
+def find_absence(low_level: str, path: str = "") -> str:
+    """Say why a low-level policy cannot run here; empty where it can."""
+    try:
+        make_policy(low_level, path or None)
+    except PolicyFileError as error:
+        return f"weights not present: {error}"
+    return ""

@@ -1,0 +1,284 @@
+"""A study: cells of trials, what is run already, and the table that comes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import xop_lerobot
+from xop_lerobot.errors import BadValue
+from xop_lerobot.evaluation.methods import find_absence
+from xop_lerobot.evaluation.pool import JobResult, run_jobs
+from xop_lerobot.evaluation.trial import TrialSetup, run_trial
+from xop_lerobot.evaluation.trial_metrics import make_record
+
+TRIALS_FILE = "trials.jsonl"
+FILMS_FOLDER = "films"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Trials of one setup with consecutive seeds.
+
+    Attributes:
+        setup: What is tried, with resolved names.
+        trials: How many trials.
+        seed: Seed of the first; the same for every method, so that all meet the same places and
+            the same person.
+        absence: Why it cannot be tried here; empty where it can.
+    """
+
+    setup: TrialSetup
+    trials: int
+    seed: int = 0
+    absence: str = ""
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the trials."""
+        return range(self.seed, self.seed + self.trials)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One trial to run.
+
+    Attributes:
+        setup: What is tried.
+        seed: Its seed.
+        folder: Folder of the results.
+    """
+
+    setup: TrialSetup
+    seed: int
+    folder: str
+
+    @property
+    def key(self) -> str:
+        """Name of the trial."""
+        return compute_key(self.setup, self.seed)
+
+
+def make_cell(setup: TrialSetup, trials: int, seed: int = 0) -> Cell:
+    """Make a cell of `setup`, whose names are checked here.
+
+    Raises:
+        UnknownName: If a name is unknown, listing the known ones.
+        BadValue: If there is no trial, or the variant contradicts itself or the method.
+    """
+    if trials < 1:
+        raise BadValue(f"trials must be at least 1, got {trials}")
+    if seed < 0:
+        raise BadValue(f"seed must be 0 or more, got {seed}")
+    setup = setup.resolved
+    return Cell(setup, trials, seed, _find_absence(setup.low_level, setup.low_level_path))
+
+
+_find_absence = cache(find_absence)
+
+
+def compute_key(setup: TrialSetup, seed: int) -> str:
+    """A name of the trial that changes with any of its settings."""
+    plain = dataclasses.asdict(dataclasses.replace(setup, low_level_path=""))
+    if setup.low_level_path:  # where it lies tells nothing, what it holds does
+        content = Path(setup.low_level_path).expanduser().read_bytes()
+        plain["low_level_path"] = hashlib.sha256(content).hexdigest()
+    text = json.dumps(plain, sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+    parts = (setup.robot, setup.task, setup.method, setup.variant, setup.low_level)
+    return f"{'-'.join(part for part in parts if part)}-{seed}-{digest}"
+
+
+@cache
+def compute_code_digest() -> str:
+    """A name of the code of this package that changes with any of its lines."""
+    folder = Path(xop_lerobot.__file__).parent
+    digest = hashlib.sha256()
+    for file in sorted(folder.rglob("*.py")):
+        digest.update(str(file.relative_to(folder)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:10]
+
+
+class Results:
+    """What has been run, in a folder: one JSON object a line, and the films beside.
+
+    Each trial is written as soon as it is over, so that whatever ends a study, what was run
+    stays. A last line that was cut off is passed over.
+
+    Args:
+        folder: The folder; made at the first trial.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._path = folder / TRIALS_FILE
+
+    def load(self) -> dict[str, dict[str, Any]]:
+        """Read the finished trials by key, of equal ones the last; errors are left out.
+
+        Raises:
+            BadValue: If the file holds something else; names file and line.
+        """
+        if not self._path.exists():
+            return {}
+        lines = self._path.read_bytes().split(b"\n")
+        found: dict[str, dict[str, Any]] = {}
+        for number, line in enumerate(lines, 1):
+            if not line.strip():
+                continue
+            try:
+                record = json.loads(line)
+                key, failed = record["key"], "error" in record
+            except (ValueError, TypeError, KeyError) as error:
+                if number == len(lines):  # no newline: killed while it was written
+                    continue
+                raise BadValue(f"'{self._path}', line {number}, is no trial: {error}") from error
+            if not failed:
+                found[key] = record
+        return found
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Write one trial, so that it survives whatever comes."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        whole = not self._path.exists() or self._path.read_bytes()[-1:] in (b"", b"\n")
+        with self._path.open("a", encoding="utf-8") as file:
+            line = json.dumps(record, allow_nan=False) + "\n"
+            file.write(line if whole else "\n" + line)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def film_path(self, key: str) -> Path:
+        """File of the positions of the trial `key`."""
+        return self.folder / FILMS_FOLDER / f"{key}.npz"
+
+
+def plan_jobs(cells: Sequence[Cell], folder: Path, finished: Iterable[str]) -> list[Job]:
+    """List the trials that are still to be run, methods in turn within each seed.
+
+    So an interrupted study is balanced: all methods have met the same seeds, give or take one.
+    """
+    done = set(finished)
+    jobs: dict[str, Job] = {}
+    for index in range(max((cell.trials for cell in cells), default=0)):
+        for cell in cells:
+            if index < cell.trials and not cell.absence:
+                job = Job(cell.setup, cell.seed + index, str(folder))
+                if job.key not in done:
+                    jobs.setdefault(job.key, job)
+    return list(jobs.values())
+
+
+def run_job(job: Job) -> dict[str, Any]:
+    """Run one trial, and keep its film in the folder; workers call this."""
+    trial = run_trial(job.setup, job.seed)
+    path = Results(Path(job.folder)).film_path(job.key)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    film = trial.film
+    partial = path.with_suffix(".part.npz")
+    np.savez_compressed(
+        partial,
+        dt=film.dt,
+        qpos=film.qpos,
+        mocap_pos=film.mocap_pos,
+        mocap_quat=film.mocap_quat,
+    )
+    partial.replace(path)
+    return {"key": job.key, **make_record(trial), "code": compute_code_digest()}
+
+
+def run_study(
+    cells: Sequence[Cell],
+    results: Results,
+    workers: int,
+    *,
+    run: Callable[[Job], dict[str, Any]] = run_job,
+    jobs: Sequence[Job] | None = None,
+) -> Generator[JobResult]:
+    """Run what is still to be run, writing each trial down before it is yielded.
+
+    Args:
+        cells: The study.
+        results: Where trials are kept; what is there already is not run again.
+        workers: Number of processes.
+        run: What runs a job; a function of a module.
+        jobs: What is to be run, where it is known already.
+    """
+    if jobs is None:
+        jobs = plan_jobs(cells, results.folder, results.load())
+    for result in run_jobs(run, jobs, workers):
+        if result.error:
+            setting = dataclasses.asdict(result.job.setup)
+            failed = {"key": result.job.key, **setting, "seed": result.job.seed}
+            results.append({**failed, "error": result.error})
+        else:
+            results.append(result.value)
+        yield result
+
+
+def collect(cell: Cell, records: Mapping[str, Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Trials of a cell that were run, in the order of their seeds."""
+    keys = (compute_key(cell.setup, seed) for seed in cell.seeds) if not cell.absence else ()
+    return [records[key] for key in keys if key in records]
+
+
+def summarise(cell: Cell, trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Make one row of the table: counts out of `trials`, means and standard deviations.
+
+    CT is over the successful trials, everything else over all. What has no value is None.
+    """
+    setup = cell.setup
+
+    def values(name: str) -> list[float]:
+        found = (trial["metrics"].get(name) for trial in trials)
+        return [value for value in found if value is not None]
+
+    times = [trial["completion_s"] for trial in trials if trial["success"]]
+    row: dict[str, Any] = {
+        "robot": setup.robot,
+        "task": setup.task,
+        "method": setup.method,
+        "variant": setup.variant,
+        "trials": len(trials),
+        "success": sum(trial["success"] for trial in trials),
+        "pickup": sum(trial["picked_up"] for trial in trials),
+        "collision": sum(trial["collision"] for trial in trials),
+        "falls": sum(trial["fallen"] for trial in trials),
+        "ct_mean": _mean(times),
+        "ct_std": _std(times),
+        "abp_mean": _mean(values("abp")),
+        "abp_std": _std(values("abp")),
+        "tilt_mean": _mean(values("tilt")),
+        "jerk_mean": _mean(values("jerk")),
+        "seeds": [trial["seed"] for trial in trials],
+        "low_level": setup.low_level,
+        "noise": setup.noise,
+        "scene": setup.scene,
+        "fps": setup.fps,
+        "tilt_std": _std(values("tilt")),
+        "jerk_std": _std(values("jerk")),
+        "abp_signed_mean": _mean(values("abp_signed")),
+    }
+    for name in ("head_error", "hands_error", "roughness", "slip", "plan_ms", "plan_p99_ms"):
+        row[f"{name}_mean"] = _mean(values(name))
+    sim, wall = (sum(trial[name] for trial in trials) for name in ("sim_s", "wall_s"))
+    row["sim_s"], row["wall_s"] = round(sim, 2), round(wall, 2)
+    row["note"] = cell.absence.partition(":")[0]
+    return row
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _std(values: Sequence[float]) -> float | None:
+    """Standard deviation of the values themselves, as the paper's of one trial is 0.00."""
+    return float(np.std(values)) if values else None

@@ -1,0 +1,320 @@
+"""One closed-loop episode: a simulated person does a task with a robot, in lock-step.
+
+All of teleoperation is in the loop, from the person's eyes to the motors, as in LeRobot's own
+loop but without LeRobot: nothing waits, nothing is recorded, and the same seed is the same trial.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from xop_lerobot.evaluation.methods import make_retargeter_config, resolve_low_level
+from xop_lerobot.link import RobotInfo, TickRecord
+from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.morphology import Morphology, make_morphology
+from xop_lerobot.operator.devices import DeviceConfig
+from xop_lerobot.operator.view import View
+from xop_lerobot.plant.config import SimulationConfig
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.state import FRAMES, RobotState
+from xop_lerobot.tasks.task import TASKS, TaskStatus, make_task
+from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+
+if TYPE_CHECKING:
+    from xop_lerobot.tasks.stage import Stage
+
+GRACE_S = 5.0
+"""How far over its task's time limit an episode may run before it is cut off [s]."""
+
+
+@dataclass(frozen=True)
+class TrialSetup:
+    """What is tried, but for the seed.
+
+    Attributes:
+        robot: Name of the robot.
+        task: Name of the task.
+        method: Name of the method.
+        variant: Variant of it; see `parse_variant`.
+        low_level: Low-level policy; empty for the robot's own.
+        low_level_path: Its file; empty for its default.
+        noise: Preset of the sensors' noise.
+        scene: Scene; empty for the task's own.
+        fps: Rate of the control loop [Hz].
+    """
+
+    robot: str
+    task: str
+    method: str = "mpc"
+    variant: str = ""
+    low_level: str = ""
+    low_level_path: str = ""
+    noise: str = "mild"
+    scene: str = ""
+    fps: int = 25
+
+    @property
+    def resolved(self) -> TrialSetup:
+        """With the names that empty ones stand for.
+
+        Raises:
+            UnknownName: If a name is unknown, listing the known ones.
+            BadValue: If the variant contradicts itself or the method.
+        """
+        morphology = make_morphology(self.robot)
+        make_retargeter_config(morphology, self.method, self.variant)
+        task = type(make_task(self.task, morphology))
+        return dataclasses.replace(
+            self,
+            low_level=resolve_low_level(morphology, self.method, self.low_level),
+            scene=self.scene or task.scenes.get(self.robot, "empty"),
+        )
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What happened, tick by tick, all of it true and not measured. n ticks.
+
+    Attributes:
+        time: Robot's clock [s]. Shape (n,).
+        engaged: Whether the person drives. Shape (n,), bool.
+        mode: Mode that the robot is in. Shape (n,).
+        qpos: Generalised position of the robot. Shape (n, nq).
+        qvel: Generalised velocity. Shape (n, nv).
+        effort: Actuator forces [N m or N]. Shape (n, nu).
+        command: Command that is executed from this tick on. Shape (n, k).
+        frames: Poses of head, wrists and palms. Shapes (n, 7).
+        goals: Goals of head and wrists, nan where there are none. Shapes (n, 7).
+        objects: Poses of what the task put into the scene. Shapes (n, 7).
+        solve_s: Duration of each solve of the retargeter [s]. Shape (m,).
+    """
+
+    time: np.ndarray
+    engaged: np.ndarray
+    mode: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    effort: np.ndarray
+    command: np.ndarray
+    frames: Mapping[str, np.ndarray]
+    goals: Mapping[str, np.ndarray]
+    objects: Mapping[str, np.ndarray]
+    solve_s: np.ndarray
+
+
+@dataclass(frozen=True)
+class Film:
+    """Positions of everything in the scene, from which pictures can be made later.
+
+    Attributes:
+        dt: Time between pictures [s].
+        qpos: Positions of robot and objects. Shape (p, nq of the scene), float32.
+        mocap_pos: Places of the furniture. Shape (p, m, 3), float32.
+        mocap_quat: Orientations of the furniture, wxyz. Shape (p, m, 4), float32.
+    """
+
+    dt: float
+    qpos: np.ndarray
+    mocap_pos: np.ndarray
+    mocap_quat: np.ndarray
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One episode.
+
+    Attributes:
+        setup: What was tried, with resolved names.
+        seed: Its seed: of placement, person, sensors and samples.
+        status: How it ended.
+        completion_s: Time from the person's first engaging to success, nan without it [s].
+        sim_s: Length of the episode after settling [s].
+        wall_s: Time that it took on this machine [s].
+        fallen: Whether the robot fell.
+        trace: What happened.
+        film: For pictures.
+    """
+
+    setup: TrialSetup
+    seed: int
+    status: TaskStatus
+    completion_s: float
+    sim_s: float
+    wall_s: float
+    fallen: bool
+    trace: Trace
+    film: Film
+
+    @property
+    def dt(self) -> float:
+        """Time between ticks [s]."""
+        return 1 / self.setup.fps
+
+
+@dataclass
+class _Rows:
+    """Collects ticks."""
+
+    ticks: list[dict[str, Any]] = field(default_factory=list)
+    solves: list[float] = field(default_factory=list)
+
+    def add(self, state: RobotState, view: View, command: np.ndarray, record: TickRecord) -> None:
+        """Add one tick."""
+        goals = record.goal.poses if record.goal is not None else {}
+        nothing = np.full(7, np.nan)
+        self.ticks.append(
+            {
+                "time": state.time,
+                "engaged": record.engaged,
+                "mode": int(state.mode),
+                "qpos": state.true_qpos,
+                "qvel": state.true_qvel,
+                "effort": state.effort,
+                "command": command,
+                "frames": dict(view.frames),
+                "goals": {name: goals.get(name, nothing) for name in FRAMES},
+                "objects": {name: each.pose for name, each in view.objects.items()},
+            }
+        )
+        if record.engaged and record.health.get("plan_age", np.inf) == 0:
+            self.solves.append(record.health.get("solve_time", 0.0))
+
+    def make_trace(self) -> Trace:
+        """Put the ticks together."""
+        columns: dict[str, Any] = {}
+        for name, first in self.ticks[0].items():
+            values = [tick[name] for tick in self.ticks]
+            if isinstance(first, dict):
+                columns[name] = {
+                    key: np.array([value[key] for value in values], float) for key in first
+                }
+            else:
+                columns[name] = np.array(values)
+        return Trace(**columns, solve_s=np.array(self.solves))
+
+
+class _Filming:
+    """Notes the positions of the whole scene, at half the rate of the control loop or so."""
+
+    def __init__(self, stage: Stage, fps: int) -> None:
+        self._data = stage.plant.data
+        self._every = max(1, round(fps / 12.5))
+        self.dt = self._every / fps
+        self._count = 0
+        self._rows: list[tuple[np.ndarray, ...]] = []
+
+    def note(self) -> None:
+        """Note what is where, if it is time to."""
+        if self._count % self._every == 0:
+            data = self._data
+            self._rows.append(
+                tuple(
+                    np.array(each, np.float32)
+                    for each in (data.qpos, data.mocap_pos, data.mocap_quat)
+                )
+            )
+        self._count += 1
+
+    def make_film(self) -> Film:
+        """Put the pictures together."""
+        return Film(self.dt, *(np.stack(column) for column in zip(*self._rows, strict=True)))
+
+
+def make_stage(setup: TrialSetup, seed: int) -> Stage:
+    """Make robot, scene and task of a resolved `setup`."""
+    from xop_lerobot.tasks.stage import Stage  # noqa: PLC0415
+
+    config = SimulationConfig(scene=setup.scene, noise=setup.noise, seed=seed)
+    return Stage(make_morphology(setup.robot), setup.task, config)
+
+
+def make_teleoperation(setup: TrialSetup, seed: int, morphology: Morphology) -> Teleoperation:
+    """Make the simulated person and the method of a resolved `setup`."""
+    path = setup.low_level_path or None
+    info = RobotInfo(setup.robot, morphology, setup.low_level, path, setup.scene, setup.fps, seed)
+    retargeter = make_retargeter_config(morphology, setup.method, setup.variant, seed)
+    device = DeviceConfig(type="simulated", seed=seed)
+    return Teleoperation(TeleoperationConfig(device=device, retargeter=retargeter), info)
+
+
+def run_trial(
+    setup: TrialSetup,
+    seed: int,
+    watch: Callable[[Stage, View, TickRecord], None] | None = None,
+) -> Trial:
+    """Run one episode.
+
+    Args:
+        setup: What is tried.
+        seed: Seed of placement, person, sensors and samples.
+        watch: Called once a tick, before time passes; for pictures and debugging.
+
+    Raises:
+        UnknownName: If a name in `setup` is unknown.
+        PolicyFileError: If the low-level policy's file is not there.
+    """
+    begin = perf_counter()
+    setup = setup.resolved
+    stage = make_stage(setup, seed)
+    policy = make_policy(setup.low_level, setup.low_level_path or None)
+    loop = PolicyLoop(stage.plant.morphology, stage.plant, policy)
+    teleoperation = make_teleoperation(setup, seed, stage.plant.morphology)
+    try:
+        teleoperation.connect()
+        loop.reset(seed)
+        stage.reset(seed)
+        teleoperation.reset()
+        return _drive(setup, seed, stage, loop, teleoperation, begin, watch)
+    finally:
+        teleoperation.disconnect()
+        loop.close()
+
+
+def _drive(
+    setup: TrialSetup,
+    seed: int,
+    stage: Stage,
+    loop: PolicyLoop,
+    teleoperation: Teleoperation,
+    begin: float,
+    watch: Callable[[Stage, View, TickRecord], None] | None,
+) -> Trial:
+    """Close the loop until the task is over."""
+    rows, filming = _Rows(), _Filming(stage, setup.fps)
+    dt, start = 1 / setup.fps, loop.state.time
+    limit = TASKS[setup.task].time_limit + GRACE_S
+    engaged_at = succeeded_at = float("nan")
+    while True:
+        state = loop.state
+        view = stage.view(state)
+        teleoperation.see(view)
+        action, record = teleoperation.step(state)
+        if record.engaged and np.isnan(engaged_at):
+            engaged_at = state.time
+        rows.add(state, view, action.command, record)
+        filming.note()
+        if watch is not None:
+            watch(stage, view, record)
+        loop.execute(action, dt)
+        status = stage.update()
+        if status.success and np.isnan(succeeded_at):
+            succeeded_at = loop.state.time
+        if status.done or loop.state.time - start > limit:
+            break
+    return Trial(
+        setup=setup,
+        seed=seed,
+        status=status,
+        completion_s=succeeded_at - engaged_at,
+        sim_s=loop.state.time - start,
+        wall_s=perf_counter() - begin,
+        fallen=loop.state.fallen,
+        trace=rows.make_trace(),
+        film=filming.make_film(),
+    )
