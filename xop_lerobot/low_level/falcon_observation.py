@@ -107,12 +107,17 @@ def compute_projected_gravity(quat: np.ndarray) -> np.ndarray:
         Shape (n, 3).
     """
     w, x, y, z = quat.T
-    return np.stack([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], axis=1)
+    gravity = np.empty((len(quat), 3))
+    gravity[:, 0] = 2 * (w * y - x * z)
+    gravity[:, 1] = -2 * (w * x + y * z)
+    gravity[:, 2] = 2 * (x * x + y * y) - 1
+    return gravity
 
 
 def compute_waist_tilt(command: np.ndarray) -> np.ndarray:
     """Commanded waist roll and pitch within their limits [rad]. Shape (n, 7) -> (n, 2)."""
-    return np.clip(command[:, 2:4], LOWER_LIMITS[WAIST_TILT], UPPER_LIMITS[WAIST_TILT])
+    low, high = LOWER_LIMITS[WAIST_TILT], UPPER_LIMITS[WAIST_TILT]
+    return np.minimum(np.maximum(command[:, 2:4], low), high)
 
 
 def build_observation(
@@ -122,6 +127,7 @@ def build_observation(
     arms: np.ndarray,
     memory: np.ndarray,
     mode: Mode | np.ndarray,
+    out: np.ndarray | None = None,
 ) -> np.ndarray:
     """Build the last five frames, oldest first, ending with the one of now.
 
@@ -132,24 +138,25 @@ def build_observation(
         arms: Arm targets, left then right [rad]. Shape (n, 14).
         memory: Last action, then the five frames before. Shape (n, 604).
         mode: Mode of all, or one of each. Shape () or (n,).
+        out: Where to write them; a new array by default. Shape (n, 575).
 
     Returns:
         Shape (n, 575).
     """
-    observation = np.empty((len(qpos), OBSERVATION_SIZE))
+    observation = np.empty((len(qpos), OBSERVATION_SIZE)) if out is None else out
     observation[:, :-FRAME_SIZE] = memory[:, NUM_JOINTS + FRAME_SIZE :]
     frame = observation[:, -FRAME_SIZE:]
     frame[:, 0:29] = memory[:, :NUM_JOINTS]
-    frame[:, 29:32] = 0.25 * qvel[:, 3:6]
+    np.multiply(qvel[:, 3:6], 0.25, out=frame[:, 29:32])
     frame[:, 32] = command[:, 6]
     frame[:, 33] = 2.0 * command[:, 0]
     frame[:, 34:36] = command[:, 4:6]
     frame[:, 36] = np.asarray(mode) == Mode.MOBILE
     frame[:, 37] = command[:, 1]
     frame[:, 38:40] = 0.0
-    frame[:, 40:69] = qpos[:, 7:] - DEFAULT_POSTURE
+    np.subtract(qpos[:, 7:], DEFAULT_POSTURE, out=frame[:, 40:69])
     frame[:, 40:69][:, WAIST_TILT] -= compute_waist_tilt(command)
-    frame[:, 69:98] = 0.05 * qvel[:, 6:]
+    np.multiply(qvel[:, 6:], 0.05, out=frame[:, 69:98])
     frame[:, 98:101] = compute_projected_gravity(qpos[:, 3:7])
     frame[:, 101:115] = arms
     return observation
@@ -170,8 +177,9 @@ def compute_targets(action: np.ndarray, command: np.ndarray, arms: np.ndarray) -
     """
     targets = DEFAULT_POSTURE + ACTION_SCALE * action
     targets[:, ARMS] += arms
-    targets[:, WAIST_TILT] = compute_waist_tilt(command)
-    return np.clip(targets, LOWER_LIMITS, UPPER_LIMITS, out=targets)
+    targets[:, WAIST_TILT] = command[:, 2:4]
+    np.maximum(targets, LOWER_LIMITS, out=targets)
+    return np.minimum(targets, UPPER_LIMITS, out=targets)
 
 
 def check_batch(name: str, array: np.ndarray, n: int, size: int) -> np.ndarray:
@@ -228,8 +236,10 @@ class FalconLikePolicy(LowLevelPolicy):
         command = check_batch("command", command, n, NUM_COMMANDS)
         arms = check_batch("arms", arms, n, NUM_ARM_JOINTS)
         memory = check_batch("memory", memory, n, MEMORY_SIZE)
-        observation = build_observation(qpos, qvel, command, arms, memory, mode)
+        after = np.empty((n, MEMORY_SIZE))  # the memory after this step: action and observation
+        observation = after[:, NUM_JOINTS:]
+        build_observation(qpos, qvel, command, arms, memory, mode, out=observation)
         action = self.infer(observation.astype(np.float32))
-        action = np.clip(action, -ACTION_LIMIT, ACTION_LIMIT)
-        memory = np.concatenate([action, observation], axis=1)
-        return PolicyOutput(compute_targets(action, command, arms), memory)
+        action = np.minimum(np.maximum(action, -ACTION_LIMIT), ACTION_LIMIT)
+        after[:, :NUM_JOINTS] = action
+        return PolicyOutput(compute_targets(action, command, arms), after)

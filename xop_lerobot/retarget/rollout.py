@@ -11,7 +11,7 @@ import mujoco.rollout
 import numpy as np
 
 from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue
+from xop_lerobot.errors import BadShape, BadValue
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 
 _DIVERGED = 1e4  # no position [m, rad] or velocity [m/s, rad/s] of a sound prediction is as large
@@ -104,10 +104,12 @@ class PolicyRollout:
         states[:, 0, 1 : 1 + nq], states[:, 0, 1 + nq : 1 + nq + nv] = qpos, qvel
         out = np.empty((num_rollouts, self.substeps, states.shape[2]))
         sensed = np.empty((num_rollouts, self.substeps, self.model.nsensordata))
+        controls = np.empty((num_rollouts, self.substeps, self.model.nu))
         sensordata = np.empty((num_rollouts, horizon + 1, self.model.nsensordata))
         sensordata[:, 0] = self._sense(qpos, qvel)
         arms = np.broadcast_to(arms, (num_rollouts, horizon, arms.shape[-1]))
         memory = np.broadcast_to(memory, (num_rollouts, len(memory)))
+        models = [self.model] * num_rollouts
         policy_s = physics_s = 0.0
         for step in range(horizon):
             start = perf_counter()
@@ -120,11 +122,16 @@ class PolicyRollout:
                 mode,
             )
             between = perf_counter()
+            if targets.shape != (num_rollouts, self.model.nu):
+                raise BadShape("targets", (num_rollouts, self.model.nu), targets.shape)
+            controls[:] = targets[:, None]
+            # All shapes are as they should be; to check and to tile them takes 0.15 ms a call.
             self._pool.rollout(
-                self.model,
+                models,
                 self._data,
-                states[:, step],
-                targets[:, None],
+                np.ascontiguousarray(states[:, step]),
+                controls,
+                skip_checks=True,
                 nstep=self.substeps,
                 state=out,
                 sensordata=sensed,
