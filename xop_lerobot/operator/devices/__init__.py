@@ -20,7 +20,7 @@ def make_device(config: DeviceConfig) -> Device:
         BadValue: If a setting is out of its range, or one that the device needs is absent.
     """
     # Implementations register themselves when they are imported.
-    from xop_lerobot.operator.devices import replay, scripted  # noqa: F401, PLC0415
+    from xop_lerobot.operator.devices import replay, scripted, simulated  # noqa: F401, PLC0415
 
     return DEVICES[config.type](config)
 

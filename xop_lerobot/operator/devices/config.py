@@ -14,7 +14,8 @@ class DeviceConfig:
     """Settings of an operator device.
 
     Attributes:
-        type: ``"replay"`` plays a recorded person, ``"scripted"`` a list of waypoints.
+        type: ``"replay"`` plays a recorded person, ``"scripted"`` a list of waypoints, and
+            ``"simulated"`` is a person who sees the robot and does its task.
         path: `replay`: an ``.npz`` recording, or the directory of a recorded dataset.
             `scripted`: a YAML file, or the name of a script that is built in.
         mode: Mode in which the operator starts, ``"stationary"`` or ``"mobile"``, where the
@@ -23,8 +24,9 @@ class DeviceConfig:
         speed: Playback speed; 0.5 plays at half the speed.
         hold_s: How long the last frame is held after the end, before the device has
             finished [s].
-        seed: `scripted`: seed of the person's sway and tremor.
-        noise: `scripted`: scale of sway and tremor, 0 none, 1 as published for healthy people.
+        seed: `scripted`: seed of the person's sway and tremor; `simulated`: of the person.
+        noise: `scripted`, `simulated`: scale of sway and tremor, 0 none, 1 as
+            published for healthy people.
     """
 
     type: str = "scripted"

@@ -1,0 +1,106 @@
+"""A simulated person who sees the robot and its task, and tries to accomplish it."""
+
+from __future__ import annotations
+
+from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.operator.device import Device
+from xop_lerobot.operator.devices import DEVICES
+from xop_lerobot.operator.devices.config import DeviceConfig
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.simulated.intentions import INTENTIONS
+from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
+from xop_lerobot.operator.view import View
+
+LINGER = 1.5
+"""Time for which the person stays after the end [s]."""
+
+
+class SimulatedDevice(Device):
+    """A person with the parameters of `Person`; the same seed is the same person.
+
+    The person begins when engaged, with the task that is shown. It knows what `see` showed it
+    and nothing else.
+
+    Args:
+        config: Its settings: `seed`, `noise` and the mode at the start.
+    """
+
+    self_engaging = True
+
+    def __init__(self, config: DeviceConfig) -> None:
+        self.config = config
+        self.start_mode = config.start_mode
+        self._task: str | None = None
+        self._attempt = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self.mind = Mind(self.config.seed, self.config.noise, self._attempt)
+        self._doing: Doing | None = None
+        self._started_at: float | None = None
+        self._over_at: float | None = None
+
+    def start(self, time: float) -> None:
+        """Begin with the task, at `time` [s] of the robot's clock; after a reset, once more."""
+        if self._started_at is not None:
+            self._attempt += 1
+            self._begin()
+        self._started_at = time
+
+    def see(self, view: View) -> None:
+        """Be shown what the headset shows.
+
+        Raises:
+            UnknownName: If no intention is known for the task, with the known ones.
+        """
+        if view.task not in INTENTIONS:
+            raise UnknownName("task of the simulated operator", view.task, INTENTIONS)
+        self._task = view.task
+        self.mind.see(view)
+
+    def read(self, time: float) -> OperatorFrame:
+        """Go on to `time` [s] of the robot's clock and return the frame of that instant.
+
+        Raises:
+            BadValue: If the person is engaged but was shown nothing.
+        """
+        if self._started_at is None:
+            return self.mind.make_frame(0.0)
+        clock = max(time - self._started_at, 0.0)
+        if clock <= self.mind.time and clock > 0:
+            return self.mind.make_frame(clock)
+        if self._task is None:
+            raise BadValue(
+                "device 'simulated' sees nothing to do: it needs a robot with a task, "
+                "--robot.task=NAME"
+            )
+        if self._doing is None:
+            self._doing = self._act(self._task)
+        self.mind.body.advance(clock)
+        self.mind.eyes.advance(time)
+        if self._over_at is None and next(self._doing, self) is self:
+            self._over_at = clock
+        return self.mind.make_frame(clock)
+
+    def is_finished(self, time: float) -> bool:
+        """Whether the person is done, or has given up, and has stayed for a moment."""
+        del time
+        return self._over_at is not None and self.mind.time >= self._over_at + LINGER
+
+    def _act(self, task: str) -> Doing:
+        mind = self.mind
+        doing = INTENTIONS[task](mind)
+        try:
+            while mind.time < mind.person.time_limit:
+                if not mind.eyes.is_blind and mind.eyes.fallen:
+                    raise GaveUp("the robot has fallen")
+                if next(doing, doing) is doing:
+                    mind.note("done")
+                    return
+                yield
+            raise GaveUp("it takes too long")
+        except GaveUp as reason:
+            mind.note(f"gave up: {reason}")
+
+
+DEVICES.add("simulated", SimulatedDevice)

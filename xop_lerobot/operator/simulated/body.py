@@ -1,0 +1,250 @@
+"""The person's own body in the own room: where it stands, how it bends, where the hands are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
+from xop_lerobot.operator.noise import HumanNoise
+from xop_lerobot.operator.simulated.person import Person
+from xop_lerobot.transforms import (
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_exp,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    wrap_angle,
+)
+
+SIDES = ("left", "right")
+OPEN, SHUT = 0.08, 0.008
+"""Distance of thumb and index tip of an open hand, and in a pinch [m]."""
+PINCHES = ((0.0, 0.25), (0.45, 0.70))
+"""Beginning and end of the two pinches of a double pinch [s]."""
+PINCH_RAMP = 0.09
+"""Time in which thumb and index close, and open [s]."""
+DOUBLE_PINCH_S = 0.75
+"""Length of a double pinch [s]."""
+RELAXED = (0.30, 0.22, -0.50)
+"""Left hand held in front: from the head, forward, left, up [m], for eyes at 1.6 m."""
+STEP_HZ = 1.6
+"""Steps in a second of slow walking."""
+BOB = (0.010, 0.012)
+"""Amplitude of the head up and down, and sideways, at 0.6 m/s [m]."""
+NECK = 0.45
+"""How far the eyes go forward with a nod, of trunk and neck in equal parts [m/rad]."""
+
+
+@dataclass(frozen=True)
+class Posture:
+    """One posture of the body.
+
+    Attributes:
+        place: Where the person stands in the own room, and the heading, x y yaw. Shape (3,).
+        drop: How far the eyes are lowered [m].
+        lean: How far the head is moved ahead and to the left of where the person stands [m].
+            Shape (2,).
+        look: Turn of the head to the left and down, against the body [rad]. Shape (2,).
+        hands: Wrists, left and right, from the head along the body's heading. Shape (2, 7).
+    """
+
+    place: np.ndarray
+    drop: float
+    lean: np.ndarray
+    look: np.ndarray
+    hands: np.ndarray
+
+    def compute_frame(self, eye_height: float) -> np.ndarray:
+        """Place of the head with the heading of the body, without turn and nod. Shape (7,)."""
+        turn = quat_from_yaw(self.place[2])
+        lean = np.array([self.lean[0] + NECK * np.sin(self.look[1]), self.lean[1], 0])
+        position = np.array([*self.place[:2], eye_height - self.drop])
+        return make_pose(position + quat_rotate(turn, lean), turn)
+
+
+def relaxed_hands(scale: float = 1.0) -> np.ndarray:
+    """Both hands held in front, palms inwards and fingers forward. Shape (2, 7)."""
+    return np.array(
+        [
+            make_pose(
+                scale * np.array(RELAXED) * [1, side, 1], quat_from_rpy(-side * np.pi / 2, 0, 0)
+            )
+            for side in (1, -1)
+        ]
+    )
+
+
+class Body:
+    """Moves from posture to posture as people move.
+
+    Reaches and bends are of minimum jerk, all parts begin and end together. Walking starts and
+    stops smoothly and is even in between; the head bobs with the steps. Sway and tremor never
+    cease. The hands go along with the body unless they are told to stay in the room.
+
+    Args:
+        person: Height and speeds.
+        noise: Sway and tremor.
+    """
+
+    def __init__(self, person: Person, noise: HumanNoise) -> None:
+        self._person, self._noise = person, noise
+        self.posture = Posture(
+            np.zeros(3), 0.0, np.zeros(2), np.zeros(2), relaxed_hands(person.eye_height / 1.6)
+        )
+        self._start = self._end = self.posture
+        self._began, self._duration, self._ramp = 0.0, 0.0, 0.0
+        self._pinched_at: dict[str, float] = {}
+        self._walked = self._speed = 0.0
+        self.time = 0.0
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether a movement is under way."""
+        return self.time < self._began + self._duration
+
+    @property
+    def is_pinching(self) -> bool:
+        """Whether a double pinch is under way."""
+        return any(self.time < at + DOUBLE_PINCH_S for at in self._pinched_at.values())
+
+    def move(self, end: Posture, duration: float) -> None:
+        """Begin to go to `end` with minimum jerk, in `duration` [s]."""
+        self._begin(end, duration, 0.0)
+
+    def walk(self, end: Posture) -> None:
+        """Begin to walk straight to `end`, evenly but for the start and the stop."""
+        way = float(np.linalg.norm(end.place[:2] - self.posture.place[:2]))
+        turn = abs(float(wrap_angle(end.place[2] - self.posture.place[2])))
+        person = self._person
+        # With minimum jerk at both ends, half of the ramps is lost.
+        walking = way / person.walk_speed + person.walk_start
+        turning = 1.875 * turn / person.turn_speed
+        if turning >= walking:
+            self._begin(end, turning, 0.0)
+        else:
+            self._begin(end, walking, person.walk_start)
+
+    def double_pinch(self, *sides: str) -> None:
+        """Begin to pinch twice with thumb and index of the hands named."""
+        for side in sides:
+            self._pinched_at[side] = self.time
+
+    def advance(self, time: float) -> None:
+        """Go on to `time` [s] of the person's clock."""
+        dt, self.time = time - self.time, time
+        last = self.posture.place[:2]
+        self.posture = self._compute_posture()
+        if dt > 0:
+            step = float(np.linalg.norm(self.posture.place[:2] - last))
+            self._walked += step
+            share = 1 - np.exp(-dt / 0.2)
+            self._speed += share * (step / dt - self._speed)
+
+    def compute_hands_in_room(self, posture: Posture | None = None) -> np.ndarray:
+        """Wrists in the own room, without sway. Shape (2, 7)."""
+        posture = posture or self.posture
+        return pose_multiply(posture.compute_frame(self._person.eye_height), posture.hands)
+
+    def with_hands_in_room(self, posture: Posture, hands: Mapping[str, np.ndarray]) -> Posture:
+        """The posture with hands at these places in the own room, and the others as they are."""
+        frame = pose_inverse(posture.compute_frame(self._person.eye_height))
+        wrists = posture.hands.copy()
+        for side, pose in hands.items():
+            wrists[SIDES.index(side)] = pose_multiply(frame, pose)
+        return replace(posture, hands=wrists)
+
+    def compute_head(self) -> np.ndarray:
+        """Pose of the head in the own room, without sway. Shape (7,)."""
+        frame = self.posture.compute_frame(self._person.eye_height)
+        nod = quat_from_rpy(0, float(self.posture.look[1]), float(self.posture.look[0]))
+        return make_pose(frame[:3], quat_multiply(frame[3:], nod))
+
+    def make_frame(self, time: float) -> OperatorFrame:
+        """What a headset would stream now, stamped `time`."""
+        frame = self.posture.compute_frame(self._person.eye_height)
+        head, hands = self.compute_head(), pose_multiply(frame, self.posture.hands)
+        sway, turn = self._noise.at(self.time), frame[3:]
+        bob = self._compute_bob()
+
+        def disturb(pose: np.ndarray, offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+            quat = quat_multiply(pose[3:], quat_exp(rotation))
+            return make_pose(pose[:3] + quat_rotate(turn, offset + bob), quat)
+
+        wrists = [disturb(hands[i], sway.wrists[i], sway.wrist_turns[i]) for i in range(2)]
+        return OperatorFrame(
+            time=time,
+            head=disturb(head, sway.head, sway.head_turn),
+            left_wrist=wrists[0],
+            right_wrist=wrists[1],
+            pinch=np.array([self._compute_pinch(side) for side in SIDES]),
+        )
+
+    def _begin(self, end: Posture, duration: float, ramp: float) -> None:
+        self._start, self._end = self.posture, end
+        self._began, self._duration, self._ramp = self.time, max(duration, 0.05), ramp
+
+    def _compute_posture(self) -> Posture:
+        if not self._duration:
+            return self.posture
+        u = (self.time - self._began) / self._duration
+        if u >= 1:
+            return self._end
+        share = _compute_ramped(u, self._ramp / self._duration) if self._ramp else None
+        u = compute_minimum_jerk(u)
+        start, end = self._start, self._end
+        turn = float(wrap_angle(end.place[2] - start.place[2]))
+        way = u if share is None else share
+        place = np.array(
+            [
+                *(start.place[:2] + way * (end.place[:2] - start.place[:2])),
+                start.place[2] + u * turn,
+            ]
+        )
+        return Posture(
+            place=place,
+            drop=start.drop + u * (end.drop - start.drop),
+            lean=start.lean + u * (end.lean - start.lean),
+            look=start.look + u * (end.look - start.look),
+            hands=interpolate_poses(start.hands, end.hands, u),
+        )
+
+    def _compute_bob(self) -> np.ndarray:
+        """The head's way up and down, and to the sides, in walking. Shape (3,)."""
+        size = min(self._speed / 0.6, 1.0) * self._noise.scale
+        phase = 2 * np.pi * STEP_HZ * self.time
+        return size * np.array([0, BOB[1] * np.sin(phase / 2), BOB[0] * np.sin(phase)])
+
+    def _compute_pinch(self, side: str) -> float:
+        since = self.time - self._pinched_at.get(side, -np.inf)
+        for start, end in PINCHES:
+            if start - PINCH_RAMP <= since - PINCH_RAMP <= end:
+                shut = compute_minimum_jerk((since - start) / PINCH_RAMP)
+                opened = compute_minimum_jerk((since - end + PINCH_RAMP) / PINCH_RAMP)
+                return OPEN + (SHUT - OPEN) * (shut - opened)
+        return OPEN
+
+
+def _compute_ramped(u: float, ramp: float) -> float:
+    """Share of the way at share u of the time: even speed, with smooth start and stop.
+
+    The speed rises over the first `ramp` of the time as a smoothstep, and falls over the last.
+    """
+    ramp = min(ramp, 0.5)
+
+    def rise(x: float) -> float:  # integral of the smoothstep 3x² − 2x³
+        return x**3 - 0.5 * x**4
+
+    if u < ramp:
+        way = ramp * rise(u / ramp)
+    elif u <= 1 - ramp:
+        way = 0.5 * ramp + (u - ramp)
+    else:
+        way = (1 - ramp) - ramp * rise((1 - u) / ramp)
+    return way / (1 - ramp)

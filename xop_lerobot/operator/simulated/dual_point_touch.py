@@ -1,0 +1,112 @@
+"""Touch two points: walk up, stand, squat if they are low, reach, correct, hold."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.simulated.body import SIDES
+from xop_lerobot.operator.simulated.hands import (
+    compute_errors,
+    compute_pointing,
+    compute_wrist,
+    look_at_work,
+    nudge,
+    plan_posture,
+    reach,
+    take_posture,
+)
+from xop_lerobot.operator.simulated.mind import Doing, Mind
+from xop_lerobot.operator.simulated.walking import compute_miss, find, go_to, set_mode
+
+POINTS = ("left_point", "right_point")
+APPROACHES = 6
+"""How often a person walks up anew before giving up."""
+CLOSER = 0.04
+"""How much closer a person stands at the next approach [m]."""
+
+
+def touch_two_points(mind: Mind) -> Doing:
+    """Bring both palms to their points and hold them there until it counts."""
+    yield from find(mind, *POINTS)
+    for approach in range(APPROACHES):
+        place = plan_place(mind, approach * CLOSER)
+        miss, turn = compute_miss(mind, place)
+        if miss > 2 * mind.person.place_tolerance or abs(turn) > mind.person.heading_tolerance:
+            yield from set_mode(mind, Mode.MOBILE)
+            yield from go_to(mind, place)
+        yield from set_mode(mind, Mode.STATIONARY)
+        yield from hold_points(mind)
+        if mind.eyes.success:
+            return
+
+
+def get_points(mind: Mind) -> dict[str, np.ndarray]:
+    """Where the two points are, by the hand that shall touch them. Shapes (3,)."""
+    return {side: mind.eyes.pose(f"{side}_point")[:3] for side in SIDES}
+
+
+def plan_place(mind: Mind, closer: float = 0.0) -> np.ndarray:
+    """Where to stand: before the middle of both points, facing it squarely.
+
+    Args:
+        mind: Who plans.
+        closer: How much closer than is comfortable [m].
+
+    Returns:
+        Place of the head and heading, x y yaw of the robot's world. Shape (3,).
+    """
+    points = get_points(mind)
+    middle = (points["left"] + points["right"]) / 2
+    across = (points["left"] - points["right"])[:2]
+    head = mind.eyes.pose("head")
+    if np.linalg.norm(across) > 0.15:  # noqa: PLR2004
+        heading = float(np.arctan2(-across[0], across[1]))
+    elif np.linalg.norm(middle[:2] - head[:2]) > 0.3:  # noqa: PLR2004
+        heading = float(np.arctan2(*(middle[:2] - head[:2])[::-1]))
+    else:
+        heading = compute_heading(head[3:])
+    person = mind.person
+    ahead = person.reach * person.eye_height / 1.6 * mind.belief.scale - closer
+    return np.array(
+        [
+            middle[0] - ahead * np.cos(heading),
+            middle[1] - ahead * np.sin(heading),
+            heading,
+        ]
+    )
+
+
+def hold_points(mind: Mind) -> Doing:
+    """Reach both points and keep the palms there; returns when it counts or cannot be done."""
+    points = get_points(mind)
+    yield from take_posture(mind, plan_posture(mind, list(points.values())))
+    points = get_points(mind)
+    mind.note("reach")
+    wrists = {}
+    for side, point in points.items():
+        quat = compute_pointing(mind, side, point)
+        wrists[side] = compute_wrist(mind, side, point, quat)
+    yield from reach(mind, wrists)
+    worst_ever, wasted = np.inf, 0
+    while not mind.eyes.success:
+        yield from mind.settle("left_palm", "right_palm")
+        points = get_points(mind)
+        yield from look_at_work(mind, points)
+        errors = compute_errors(mind, points)
+        worst = max(float(np.linalg.norm(error)) for error in errors.values())
+        mind.note(f"palms {100 * worst:.1f} cm off")
+        if worst <= mind.person.hand_tolerance:
+            yield from mind.pause(0.4)
+            continue
+        wasted = 0 if worst < 0.8 * worst_ever else wasted + 1
+        worst_ever = min(worst, worst_ever)
+        if wasted >= mind.person.corrections:
+            return
+        far = {
+            side: error
+            for side, error in errors.items()
+            if np.linalg.norm(error) > 0.6 * mind.person.hand_tolerance
+        }
+        yield from nudge(mind, far)

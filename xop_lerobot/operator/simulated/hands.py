@@ -1,0 +1,164 @@
+"""To stand so that the hands can reach, and to bring them to where one wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from xop_lerobot.operator.simulated.body import SIDES, Posture
+from xop_lerobot.operator.simulated.mind import Doing, Mind
+from xop_lerobot.transforms import (
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_from_matrix,
+    quat_from_yaw,
+    quat_rotate,
+    quat_to_rpy,
+)
+
+MARGIN = 0.15
+"""How far within the field of view a person wants to have what the hands work on [rad]."""
+LARGEST_NOD = 0.5
+"""Largest nod [rad]."""
+SHOULDER = (-0.08, 0.18, -0.28)
+"""Left shoulder from the eyes, forward, left, up [m], for eyes at 1.6 m."""
+
+
+def compute_reach_time(mind: Mind, distance: float) -> float:
+    """Time of a reach [s]: Fitts's law, T = a + b log2(D/W + 1), taken with care."""
+    person = mind.person
+    bits = np.log2(distance / person.hand_width + 1)
+    fitts = person.care * (person.fitts_a + person.fitts_b * bits)
+    return float(max(fitts, distance / person.hand_speed, 0.25))
+
+
+def plan_posture(mind: Mind, points: list[np.ndarray]) -> Posture:
+    """How to hold the body so that points of the robot's world are at a good height.
+
+    Within a comfortable range below the eyes a person stands upright; for what is lower the
+    person squats, and nods to see it.
+    """
+    person, belief, body = mind.person, mind.belief, mind.body
+    middle = np.mean(points, axis=0)
+    standing = person.eye_height
+    below = standing - belief.height_to_own(float(middle[2]))
+    drop = float(np.clip(below - person.reach_low * standing / 1.6, 0.0, person.leg_bend))
+    lowest = standing - drop - belief.height_to_own(float(min(p[2] for p in points)))
+    nod = np.arctan2(lowest, person.reach * standing / 1.6)
+    nod -= person.view_half_angles[1] - MARGIN
+    look = np.array([0.0, float(np.clip(nod, 0.0, LARGEST_NOD))])
+    return replace(body.posture, drop=drop, lean=np.zeros(2), look=look)
+
+
+def take_posture(mind: Mind, posture: Posture) -> Doing:
+    """Squat, rise or nod; the hands go along with the head."""
+    last = mind.body.posture
+    way = abs(posture.drop - last.drop) + float(np.linalg.norm(posture.lean - last.lean))
+    turn = float(np.linalg.norm(posture.look - last.look))
+    duration = max(way / mind.person.posture_speed, 1.875 * turn / mind.person.turn_speed)
+    mind.body.move(posture, max(duration, 0.4))
+    yield from mind.settle("head")
+
+
+def look_at_work(mind: Mind, points: Mapping[str, np.ndarray]) -> Doing:
+    """Nod until hands and points are in view; the hands stay where they are in the room."""
+    head = mind.eyes.pose("head")
+    angles = []
+    for side, point in points.items():
+        for each in (point, mind.feel(f"{side}_palm")[:3]):
+            way = each - head[:3]
+            angles.append(np.arctan2(-way[2], np.hypot(way[0], way[1])))
+    pitch = float(quat_to_rpy(head[3:])[1])
+    more = max(angles) - pitch - mind.person.view_half_angles[1] + MARGIN / 2
+    body, last = mind.body, mind.body.posture
+    nod = float(np.clip(last.look[1] + more, last.look[1], LARGEST_NOD))
+    if nod - last.look[1] < 0.02:  # noqa: PLR2004 not worth it
+        return
+    mind.note(f"nod by {np.degrees(nod - last.look[1]):.0f}°")
+    room = body.compute_hands_in_room()
+    posture = replace(last, look=np.array([0.0, nod]))
+    keep = dict(zip(SIDES, room, strict=True))
+    yield from take_posture(mind, body.with_hands_in_room(posture, keep))
+
+
+def compute_wrist(mind: Mind, side: str, palm: np.ndarray, quat: np.ndarray) -> np.ndarray:
+    """Wrist pose that brings the palm to a point, with the hand turned so. Shape (7,).
+
+    How the robot's palm sits on its wrist a person sees.
+    """
+    if mind.eyes.sees(f"{side}_wrist") and mind.eyes.sees(f"{side}_palm"):
+        wrist, seen = mind.eyes.pose(f"{side}_wrist"), mind.eyes.pose(f"{side}_palm")
+    else:
+        wrist, seen = mind.feel(f"{side}_wrist"), mind.feel(f"{side}_palm")
+    offset = pose_multiply(pose_inverse(wrist), seen)[:3]
+    return make_pose(palm - quat_rotate(quat, offset), quat)
+
+
+def compute_pointing(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
+    """How a hand is turned that goes for a point: along the arm, palm inwards. Shape (4,)."""
+    left = 1.0 if side == "left" else -1.0
+    own = mind.body.compute_head()
+    frame = mind.body.posture.compute_frame(mind.person.eye_height)
+    shoulder = frame[:3] + quat_rotate(
+        frame[3:], np.array(SHOULDER) * [1, left, 1] * mind.person.eye_height / 1.6
+    )
+    reach = point - mind.belief.point_to_robot(shoulder, own)
+    turn = quat_from_yaw(mind.belief.turn + float(mind.body.posture.place[2]))
+    ahead = quat_rotate(turn, np.array([1.0, 0, 0]))
+    # The wrist bends some of the way from straight ahead to along the arm.
+    forward = _unit(ahead + _unit(reach))
+    outwards = quat_rotate(turn, np.array([0, left, 0]))
+    up = _unit(outwards - (outwards @ forward) * forward)
+    return quat_from_matrix(np.column_stack([forward, np.cross(up, forward), up]))
+
+
+def reach(mind: Mind, wrists: Mapping[str, np.ndarray], slowness: float = 1.0) -> Doing:
+    """Bring hands to wrist poses of the robot's world, as believed; both arrive together.
+
+    Args:
+        mind: Who reaches.
+        wrists: Wrist poses by side. Shapes (7,).
+        slowness: Factor on the time.
+    """
+    body = mind.body
+    own = body.compute_head()
+    room, goals = body.compute_hands_in_room(), {}
+    for side, pose in wrists.items():
+        position = mind.belief.point_to_own(pose[:3], own)
+        way = float(np.linalg.norm(position - room[SIDES.index(side)][:3]))
+        goals[side] = make_pose(position + mind.scatter(way), mind.belief.quat_to_own(pose[3:]))
+    yield from move_hands(mind, goals, slowness)
+
+
+def nudge(mind: Mind, errors: Mapping[str, np.ndarray], slowness: float = 1.0) -> Doing:
+    """Move hands by what they are seen to miss, in the robot's world [m]. Shapes (3,)."""
+    body, gain = mind.body, mind.person.hand_gain
+    room, goals = body.compute_hands_in_room(), {}
+    for side, error in errors.items():
+        step = gain * mind.belief.vector_to_own(error)
+        last = room[SIDES.index(side)]
+        way = float(np.linalg.norm(step))
+        goals[side] = make_pose(last[:3] + step + mind.scatter(way), last[3:])
+    yield from move_hands(mind, goals, slowness)
+
+
+def move_hands(mind: Mind, goals: Mapping[str, np.ndarray], slowness: float = 1.0) -> Doing:
+    """Move hands to poses of the own room, in one movement."""
+    body = mind.body
+    room = body.compute_hands_in_room()
+    ways = [np.linalg.norm(pose[:3] - room[SIDES.index(s)][:3]) for s, pose in goals.items()]
+    duration = slowness * compute_reach_time(mind, float(max(ways)))
+    body.move(body.with_hands_in_room(body.posture, goals), duration)
+    yield from mind.finish()
+
+
+def compute_errors(mind: Mind, points: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What each palm is seen to miss its point by, robot's world [m]. Shapes (3,)."""
+    return {side: point - mind.feel(f"{side}_palm")[:3] for side, point in points.items()}
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)

@@ -1,0 +1,13 @@
+"""What a person sets out to do, by the name of the task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from xop_lerobot.operator.simulated.dual_point_touch import touch_two_points
+from xop_lerobot.operator.simulated.mind import Doing, Mind
+from xop_lerobot.registry import Registry
+
+INTENTIONS: Registry[Callable[[Mind], Doing]] = Registry("task of the simulated operator")
+"""What the person does for each task, as a generator over ticks."""
+INTENTIONS.add("dual_point_touch", touch_two_points)

@@ -1,0 +1,194 @@
+"""What a person sees of the robot's world: late, within the field of view, and not quite."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.operator.simulated.person import Person
+from xop_lerobot.operator.view import SeenObject, View
+from xop_lerobot.transforms import make_pose, quat_conjugate, quat_exp, quat_multiply, quat_rotate
+
+WINDOW = 0.4
+"""Time over which a person judges whether something moves [s]."""
+SETTLE = 0.3
+"""Time over which what is seen is averaged, as long as it stands still [s]."""
+JUMP = 0.06
+"""Distance beyond which a thing has moved, and its place is seen anew [m]."""
+TURN_NOISE = 0.02
+"""Error of the orientation of what is seen [rad]."""
+HANDS = ("left_wrist", "right_wrist", "left_palm", "right_palm")
+
+
+class _Drift:
+    """An error that changes slowly: an Ornstein-Uhlenbeck process of unit variance."""
+
+    def __init__(self, rng: np.random.Generator, time_constant: float) -> None:
+        self._rng, self._time_constant = rng, time_constant
+        self.value = rng.standard_normal(6)
+
+    def advance(self, dt: float) -> None:
+        keep = float(np.exp(-dt / self._time_constant))
+        noise = self._rng.standard_normal(6)
+        self.value = keep * self.value + np.sqrt(1 - keep * keep) * noise
+
+
+class Perception:
+    """Keeps what was shown, and gives out what a person would know of it by now.
+
+    A thing at distance d is seen at :math:`(1 + b)d` along the line of sight, b the person's own
+    bias, with a slow error that grows with d; so two things that are close together are seen at
+    nearly the right distance from each other. What leaves the field of view is remembered where
+    it was seen last. The robot's hands and what is about it are seen from the robot's head,
+    whose own place a person knows from the floor and the walls.
+
+    Args:
+        person: Delays, field of view and errors.
+        rng: Source of the errors.
+    """
+
+    def __init__(self, person: Person, rng: np.random.Generator) -> None:
+        self._person, self._rng = person, rng
+        self._bias = float(rng.normal(0, person.depth_bias))
+        self._drifts: dict[str, _Drift] = {}
+        self._queue: deque[View] = deque()
+        self._trail: deque[View] = deque()
+        self._seen: dict[str, SeenObject] = {}
+        self._in_view: set[str] = set()
+
+    def show(self, view: View) -> None:
+        """Take what the robot's cameras see now; the person knows of it later."""
+        self._queue.append(view)
+
+    def advance(self, time: float) -> None:
+        """Perceive all that has arrived by `time` [s] of the robot's clock."""
+        while self._queue and self._queue[0].time <= time - self._person.delay + 1e-9:
+            self._perceive(self._queue.popleft())
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether nothing has been seen yet."""
+        return not self._trail
+
+    @property
+    def _view(self) -> View:
+        return self._trail[-1]
+
+    @property
+    def time(self) -> float:
+        """When what is known now has happened [s, robot's clock]."""
+        return self._view.time
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self._view.task
+
+    @property
+    def mode(self) -> Mode:
+        """Mode that the display shows."""
+        return self._view.mode
+
+    @property
+    def success(self) -> bool:
+        """Whether the display says that the task is accomplished."""
+        return self._view.success
+
+    @property
+    def fallen(self) -> bool:
+        """Whether the robot has fallen."""
+        return self._view.fallen
+
+    def knows(self, name: str) -> bool:
+        """Whether the thing was ever seen."""
+        return name in self._seen
+
+    def sees(self, name: str) -> bool:
+        """Whether the thing is in the field of view."""
+        return name in self._in_view
+
+    def pose(self, name: str) -> np.ndarray:
+        """Where the thing is, or was when it was last seen, robot's world. Shape (7,)."""
+        return self._seen[name].pose
+
+    def size(self, name: str) -> np.ndarray:
+        """Half the extents of the thing [m]. Shape (3,)."""
+        return self._seen[name].size
+
+    @property
+    def names(self) -> list[str]:
+        """Everything that exists for the task, seen or not."""
+        return list(self._view.objects)
+
+    def compute_movement(self, names: tuple[str, ...]) -> float:
+        """How far the fastest of the robot's frames has moved in the last 0.4 s [m]."""
+        first, last = self._trail[0].frames, self._view.frames
+        if self._view.time - self._trail[0].time < 0.9 * WINDOW:
+            return np.inf
+        return max(float(np.linalg.norm(last[n][:3] - first[n][:3])) for n in names)
+
+    def _perceive(self, view: View) -> None:
+        dt = view.time - self._trail[-1].time if self._trail else 0.0
+        self._trail.append(view)
+        while view.time - self._trail[0].time > WINDOW + 1e-9:
+            self._trail.popleft()
+        for drift in self._drifts.values():
+            drift.advance(dt)
+        head = np.asarray(view.frames["head"], dtype=float)
+        self._in_view = set()
+        error = self._get_drift("head").value
+        head_seen = make_pose(
+            head[:3] + self._person.place_noise * error[:3],
+            quat_multiply(quat_exp(0.25 * TURN_NOISE * error[3:]), head[3:]),
+        )
+        self._note("head", SeenObject(head_seen), dt)
+        for name in HANDS:
+            if name in view.frames:
+                self._look_at(name, SeenObject(view.frames[name]), head, dt)
+        for name, thing in view.objects.items():
+            self._look_at(name, thing, head, dt)
+
+    def _look_at(self, name: str, thing: SeenObject, head: np.ndarray, dt: float) -> None:
+        offset = quat_rotate(quat_conjugate(head[3:]), thing.pose[:3] - head[:3])
+        # The hands are felt as well as seen: one knows where one's own hands are.
+        if not self._is_in_view(offset, float(np.max(thing.size))):
+            return
+        self._in_view.add(name)
+        person, error = self._person, self._get_drift(name).value
+        distance = max(float(np.linalg.norm(offset)), 1e-6)
+        ray = offset / distance
+        along = float(error[:3] @ ray) * ray
+        blur = person.place_noise * error[:3] + distance * (
+            person.depth_noise * along + person.side_noise * (error[:3] - along)
+        )
+        seen = head[:3] + quat_rotate(head[3:], (1 + self._bias) * offset + blur)
+        quat = quat_multiply(quat_exp(TURN_NOISE * error[3:]), thing.pose[3:])
+        self._note(name, SeenObject(make_pose(seen, quat), np.array(thing.size)), dt)
+
+    def _is_in_view(self, offset: np.ndarray, radius: float) -> bool:
+        """Whether the middle of a thing, or much of it, is within the field of view."""
+        wide, high = self._person.view_half_angles
+        distance = float(np.linalg.norm(offset))
+        slack = np.arctan2(0.5 * radius, max(distance, 1e-6))
+        side = np.arctan2(offset[1], offset[0])
+        up = np.arctan2(offset[2], np.hypot(offset[0], offset[1]))
+        return bool(abs(side) <= wide + slack and abs(up) <= high + slack)
+
+    def _get_drift(self, name: str) -> _Drift:
+        if name not in self._drifts:
+            self._drifts[name] = _Drift(self._rng, self._person.noise_s)
+        return self._drifts[name]
+
+    def _note(self, name: str, thing: SeenObject, dt: float) -> None:
+        """Average what stands still, follow what moves."""
+        last = self._seen.get(name)
+        if last is not None:
+            step = thing.pose[:3] - last.pose[:3]
+            if np.linalg.norm(step) < JUMP and name not in HANDS and name != "head":
+                share = 1 - np.exp(-dt / SETTLE)
+                thing = SeenObject(
+                    make_pose(last.pose[:3] + share * step, thing.pose[3:]), thing.size
+                )
+        self._seen[name] = thing

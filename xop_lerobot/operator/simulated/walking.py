@@ -1,0 +1,171 @@
+"""To find things, to go where one wants to stand, and to change the mode."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.simulated.body import Posture, relaxed_hands
+from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
+from xop_lerobot.transforms import wrap_angle
+
+GLANCES = (0.7, -0.7)
+"""Turns of the head with which a person looks about [rad]."""
+BODY_TURN = 1.4
+"""Turn of the body at a time, for what is not beside either [rad]."""
+MOST_TURNS = 5
+"""How many of them a person makes before giving up."""
+MODE_WAIT = 1.4
+"""Longest wait for the display to show the other mode [s]."""
+MODE_TRIES = 6
+"""How often a person tries a double pinch before giving up."""
+TURN_FIRST = 0.35
+"""Angle up to which a person sets out without turning first [rad]."""
+
+
+def find(mind: Mind, *names: str) -> Doing:
+    """Look about until each thing was seen, first with the head, then with the body."""
+    while mind.eyes.is_blind:
+        yield
+    yield from mind.settle()
+    if _knows(mind, names):
+        return
+    mind.note("look about")
+    for glance in GLANCES:
+        yield from _turn_head(mind, glance, names)
+        if _knows(mind, names):
+            return
+    yield from _turn_head(mind, 0.0)
+    yield from set_mode(mind, Mode.MOBILE)
+    for _ in range(MOST_TURNS):
+        posture = mind.body.posture
+        mind.body.walk(replace(posture, place=posture.place + np.array([0, 0, BODY_TURN])))
+        yield from _search(mind, names)
+        if _knows(mind, names):
+            return
+    raise GaveUp(f"did not find {', '.join(names)}")
+
+
+def set_mode(mind: Mind, mode: Mode) -> Doing:
+    """Pinch twice with the left hand, and look at the display whether it took."""
+    if mind.eyes.mode is mode:
+        return
+    for _ in range(MODE_TRIES):
+        mind.note(f"double pinch for {mode.name.lower()}")
+        yield from mind.finish()
+        yield from mind.pause(0.2)
+        mind.body.double_pinch("left")
+        yield from mind.finish()
+        limit = mind.time + MODE_WAIT
+        while mind.eyes.mode is not mode and mind.time < limit:
+            yield
+        if mind.eyes.mode is mode:
+            return
+    raise GaveUp(f"could not change to {mode.name.lower()}")
+
+
+def go_to(
+    mind: Mind,
+    place: np.ndarray,
+    *,
+    tolerance: float | None = None,
+    hands: np.ndarray | None = None,
+    tries: int = 8,
+) -> Doing:
+    """Walk until the robot's head is at a place, x y yaw of the robot's world.
+
+    Each leg is walked as planned, then the person stops and looks; what is left is the next
+    leg. After `tries` legs it has to do.
+
+    Args:
+        mind: Who goes.
+        place: Where the robot's head shall be, and its heading.
+        tolerance: How far beside it is good enough [m].
+        hands: Wrists while walking, from the head (2, 7); relaxed in front by default.
+        tries: Most legs.
+    """
+    person = mind.person
+    near = person.place_tolerance if tolerance is None else tolerance
+    hands = relaxed_hands(person.eye_height / 1.6) if hands is None else hands
+    yield from mind.settle()
+    for leg in range(tries):
+        miss, turn = compute_miss(mind, place)
+        if miss <= near and abs(turn) <= person.heading_tolerance:
+            return
+        mind.note(f"leg {leg}: {100 * miss:.0f} cm, {np.degrees(turn):.0f}° to go")
+        target = mind.belief.place_to_own(place)
+        target[:2] += mind.scatter(miss, 2)
+        target[2] += float(mind.scatter(abs(turn), 1)[0])
+        yield from _walk(mind, target, hands, straight=leg % 3 == 2)  # noqa: PLR2004
+        yield from mind.settle("head", patience=2.5)
+
+
+def compute_miss(mind: Mind, place: np.ndarray) -> tuple[float, float]:
+    """How far the robot's head is seen from a place [m], and the turn that is left [rad]."""
+    head = mind.eyes.pose("head")
+    return (
+        float(np.linalg.norm(place[:2] - head[:2])),
+        float(wrap_angle(place[2] - compute_heading(head[3:]))),
+    )
+
+
+def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, *, straight: bool) -> Doing:
+    """One leg: short ways by steps to any side, long ones ahead, with turns before and after.
+
+    What the steps to the side did not bring, the person then goes straight for (`straight`).
+    """
+    body, person = mind.body, mind.person
+    upright = replace(
+        body.posture, drop=0.0, lean=np.zeros(2), look=np.zeros(2), hands=hands.copy()
+    )
+    changed = body.posture.drop + float(np.abs(body.posture.lean).sum())
+    if changed > 0.01 or not np.allclose(body.posture.hands, hands, atol=1e-3):
+        body.move(upright, max(0.8, changed / person.posture_speed))
+        yield from mind.finish()
+    way = target[:2] - body.posture.place[:2]
+    length = float(np.linalg.norm(way))
+    if length > person.step_length or (straight and length > person.place_tolerance):
+        course = float(np.arctan2(way[1], way[0]))
+        bend = abs(float(wrap_angle(course - body.posture.place[2])))
+        if TURN_FIRST < bend:
+            body.walk(_at(mind, *body.posture.place[:2], course))
+            yield from mind.settle("head", patience=1.5)
+            # Turning on the spot has taken the head along; aim once more.
+        body.walk(_at(mind, *target[:2], course))
+        yield from mind.finish()
+        if abs(float(wrap_angle(target[2] - course))) > TURN_FIRST:
+            yield from mind.pause(mind.person.decision_s)
+    body.walk(_at(mind, *target))
+    yield from mind.finish()
+
+
+def _at(mind: Mind, x: float, y: float, yaw: float) -> Posture:
+    return replace(mind.body.posture, place=np.array([x, y, yaw]))
+
+
+def _turn_head(mind: Mind, angle: float, names: tuple[str, ...] = ()) -> Doing:
+    posture = mind.body.posture
+    look = np.array([angle, posture.look[1]])
+    turn = abs(angle - posture.look[0])
+    mind.body.move(replace(posture, look=look), 1.875 * turn / mind.person.turn_speed)
+    if names:
+        yield from _search(mind, names)
+    else:
+        yield from mind.settle("head")
+
+
+def _search(mind: Mind, names: tuple[str, ...]) -> Doing:
+    """Wait for the turn that is under way, or until all is seen; the turn then comes to rest."""
+    yield from mind.finish()
+    limit = mind.time + mind.person.patience
+    while mind.time < limit and not _knows(mind, names):
+        if mind.eyes.compute_movement(("head",)) <= mind.person.still:
+            break
+        yield
+
+
+def _knows(mind: Mind, names: tuple[str, ...]) -> bool:
+    return all(mind.eyes.knows(name) for name in names)
