@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from xop_lerobot.retarget.costs.upright import make_level
 from xop_lerobot.state import Goal
-from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
+from xop_lerobot.transforms import make_pose, quat_multiply
 
 
 def hold_near(goal: Goal, poses: Mapping[str, np.ndarray], reach: float) -> Goal:
@@ -69,6 +70,29 @@ def preview(
         if velocity is None or not np.any(velocity):
             goals[name] = np.broadcast_to(pose, (len(times), 7))
             continue
-        position = pose[:3] + times * velocity[:3]
-        goals[name] = make_pose(position, quat_multiply(quat_exp(times * velocity[3:]), pose[3:]))
+        goals[name] = carry_on(pose, velocity, times)
     return goals
+
+
+def carry_on(pose: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> np.ndarray:
+    r"""Carry a pose on at a velocity: :math:`p + v t,\ e^{\omega t/2} \circ q`.
+
+    About an axis n that stays, :math:`e^{n\alpha/2} \circ q = \cos\frac\alpha2\,q +
+    \sin\frac\alpha2\,(n \circ q)`: one product for all times.
+
+    Args:
+        pose: Pose at t = 0. Shape (7,).
+        velocity: Linear [m/s], then angular [rad/s], world axes. Shape (6,).
+        times: Times [s]. Shape (n, 1).
+
+    Returns:
+        Poses. Shape (n, 7).
+    """
+    x, y, z = (float(rate) for rate in velocity[3:])
+    rate = math.sqrt(x * x + y * y + z * z)
+    axis = np.array([0.0, x, y, z]) / max(rate, 1e-12)
+    half = times * (rate / 2)
+    poses = np.empty((len(times), 7))
+    poses[:, :3] = pose[:3] + times * velocity[:3]
+    poses[:, 3:] = np.cos(half) * pose[3:] + np.sin(half) * quat_multiply(axis, pose[3:])
+    return poses

@@ -75,6 +75,7 @@ class MpcRetargeter(Retargeter):
         self._collision = CollisionCost(
             make_obstacles(model) if obstacles is None else obstacles, hull
         )
+        self._model = model
         self.readings = Readings(morphology, model, hull if self._collision.obstacles else {})
         self.support = None
         if morphology.support:
@@ -174,6 +175,14 @@ class MpcRetargeter(Retargeter):
             planner.reset(self._planners[mode].commands[0])
         return planner
 
+    def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
+        """Keep clear of these and no others from the next solve on."""
+        with self._lock:
+            self._collision.set_obstacles(obstacles)
+            # Without obstacles the hull is not read, which saves time.
+            hull = self.morphology.hull_points if obstacles else {}
+            self.readings = Readings(self.morphology, self._model, hull)
+
     def control_period(self, mode: Mode) -> float:
         """Time between two plans in `mode` [s]."""
         return 1 / self.configs[mode].control_hz
@@ -212,7 +221,8 @@ class MpcRetargeter(Retargeter):
         poses = self.readings.compute_poses(state.qpos, self.sites)
         goal = hold_near(goal, poses, config.reach)
         goal = hold_level(goal, self._find_upright())
-        then = self._preview(goal, config.proposal_s, config)
+        goals = self._preview(goal, _compute_times(config), config)
+        then = {name: poses[-1:] for name, poses in goals.items()}
         facing = np.zeros(2)
         if self.command_model.is_nonholonomic and mode is Mode.MOBILE:
             facing = self._facing.compute(state.qpos, poses, then, config.proposal_s)
@@ -229,7 +239,7 @@ class MpcRetargeter(Retargeter):
         proposal = np.where(acting, proposal, held)
         candidates = self.candidates.collect(state, goal, executed, proposal, config)
         candidates = np.where(acting, candidates, held)
-        noise = self._noise[mode] * acting * self._compute_noise_share(poses, goal, config)
+        noise = self._noise[mode] * acting * _compute_noise_share(poses, goals, config)
         samples = planner.sample(self._rng, noise, candidates)
         commands = self.space.restrict(np.where(acting, samples.commands, held), mode)
         sampled = perf_counter()
@@ -239,7 +249,7 @@ class MpcRetargeter(Retargeter):
         rolled = perf_counter()
         with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
             evaluation = self._evaluate(
-                prediction, commands, goal, executed, proposal, facing, drift, config
+                prediction, commands, mode, goals, executed, proposal, facing, drift, config
             )
             terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
         costs = np.sum(list(terms.values()), axis=0)
@@ -302,17 +312,6 @@ class MpcRetargeter(Retargeter):
     ) -> dict[str, np.ndarray]:
         return preview(goal, self.frames, np.atleast_1d(ahead), config.preview_s)
 
-    def _compute_noise_share(
-        self, poses: Mapping[str, np.ndarray], goal: Goal, config: MpcConfig
-    ) -> float:
-        """Share of the full noise: little at the goal, where fine commands are what counts."""
-        error = 0.0
-        ahead = config.horizon * POLICY_DT
-        for name, goals in self._preview(goal, ahead, config).items():
-            cosine = min(abs(float(goals[0, 3:] @ poses[name][3:])), 1.0)  # of half the angle
-            error = max(error, math.dist(poses[name][:3], goals[0, :3]), math.acos(cosine))
-        return float(np.clip(error / config.full_noise_error, config.min_noise, 1.0))
-
     def _predict(self, state: RobotState, decisions: np.ndarray, mode: Mode) -> Prediction:
         """Roll decisions out. Shape (K, H, n)."""
         commands, arms = self.decision.split(decisions, state.arms, self.command_model.body)
@@ -325,7 +324,8 @@ class MpcRetargeter(Retargeter):
         self,
         prediction: Prediction,
         commands: np.ndarray,
-        goal: Goal,
+        mode: Mode,
+        goals: Mapping[str, np.ndarray],
         executed: np.ndarray,
         proposal: np.ndarray,
         facing: np.ndarray,
@@ -338,13 +338,13 @@ class MpcRetargeter(Retargeter):
             "neutral": self.space.neutral,
             "zero": np.zeros(len(executed)),
         }
-        decided = self.command_model.acting(goal.mode)
+        decided = self.command_model.acting(mode)
         reference = np.where(decided, references[config.control_reference], commands[0, 0])
         extrapolated = self.command_model.extrapolate(
             prediction.qpos[:, -1],
             commands[:, -1],
             config.extrapolation_s,
-            goal.mode,
+            mode,
             drift,
             executed=prediction.commands[:, -1],
             offset=self.offset.offset,
@@ -352,10 +352,8 @@ class MpcRetargeter(Retargeter):
                 self.offset.settled, commands[:, -1], config.horizon * POLICY_DT
             ),
         )
-        sites = {name: site for name, site in self.sites.items() if name in goal.poses}
-        ahead = np.arange(config.horizon + 1) * POLICY_DT
-        last = ahead[-1] + config.extrapolation_s
-        goals = self._preview(goal, np.append(ahead, last), config)
+        sites = {name: site for name, site in self.sites.items() if name in goals}
+        end = config.horizon + 1
         now = self.readings.read(prediction.sensordata, sites)
         then = self.readings.place(extrapolated, sites)
         return Evaluation(
@@ -372,10 +370,10 @@ class MpcRetargeter(Retargeter):
             terminal_poses=then.poses,
             terminal_points=then.points,
             terminal_com=then.com,
-            goals={name: poses[:-1] for name, poses in goals.items()},
-            terminal_goals={name: poses[-1] for name, poses in goals.items()},
+            goals={name: poses[:end] for name, poses in goals.items()},
+            terminal_goals={name: poses[end] for name, poses in goals.items()},
             facing=facing,
-            mode=goal.mode,
+            mode=mode,
             dt=POLICY_DT,
             weights=config.weights,
             upright=tuple(name for name in self._find_upright() if name in sites),
@@ -400,3 +398,31 @@ class MpcRetargeter(Retargeter):
 
 def _finite(value: float) -> float:
     return float(value) if math.isfinite(value) else 0.0
+
+
+def _compute_times(config: MpcConfig) -> np.ndarray:
+    """Times at which goals are asked for [s]: the control steps, and two further ones.
+
+    Those are the end of the extrapolation, and what the proposal aims at. Shape (H + 3,).
+    """
+    end = config.horizon * POLICY_DT
+    steps = np.arange(config.horizon + 1) * POLICY_DT
+    return np.append(steps, [end + config.extrapolation_s, config.proposal_s])
+
+
+def _compute_noise_share(
+    poses: Mapping[str, np.ndarray], goals: Mapping[str, np.ndarray], config: MpcConfig
+) -> float:
+    """Share of the full noise: little at the goal, where fine commands are what counts.
+
+    Args:
+        poses: Tracked frames now. Shapes (7,).
+        goals: Their goals at `_compute_times`. Shapes (H + 3, 7).
+        config: Parameters of the mode.
+    """
+    error = 0.0
+    for name, track in goals.items():
+        pose, goal = poses[name], track[config.horizon]
+        cosine = min(abs(float(goal[3:] @ pose[3:])), 1.0)  # of half the angle
+        error = max(error, math.dist(pose[:3], goal[:3]), math.acos(cosine))
+    return min(max(error / config.full_noise_error, config.min_noise), 1.0)
