@@ -267,9 +267,9 @@ def run_trial(
     teleoperation = make_teleoperation(setup, seed, stage.plant.morphology)
     try:
         teleoperation.connect()
-        loop.reset(seed)
+        loop.reset(seed, start=stage.start)
         stage.reset(seed)
-        teleoperation.reset()
+        teleoperation.reset(stage.obstacles)
         return _drive(setup, seed, stage, loop, teleoperation, begin, watch)
     finally:
         teleoperation.disconnect()
@@ -305,8 +305,11 @@ def _drive(
         status = stage.update()
         if status.success and np.isnan(succeeded_at):
             succeeded_at = loop.state.time
-        if status.done or loop.state.time - start > limit:
+        gave_up = teleoperation.device.is_finished(loop.state.time) and not status.success
+        if status.done or gave_up or loop.state.time - start > limit:
             break
+    if gave_up and not status.failure:
+        status = dataclasses.replace(status, failure="the person gave up")
     return Trial(
         setup=setup,
         seed=seed,

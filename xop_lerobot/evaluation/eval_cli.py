@@ -1,0 +1,320 @@
+"""`xop-eval`: the paper's simulation study, with a simulated person in the headset.
+
+    xop-eval --robot g1 --task dual_point_touch --methods mpc,mpc_no_sync,direct --json out.json
+    xop-eval --config configs/paper_tables.yaml --report outputs/paper_tables
+
+Trials run in parallel processes, each written down as soon as it is over. The same command goes
+on where an interrupted one stopped, and adds no trial that is there already.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import logging
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from xop_lerobot.errors import BadValue, UnknownName, XopError
+
+logger = logging.getLogger(__name__)
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+DEFAULT_TRIALS = 20
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are the project's own."""
+
+    def error(self, message: str) -> NoReturn:
+        raise BadValue(message)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line."""
+    parser = _Parser(
+        prog="xop-eval",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("--config", type=Path, help="YAML file of a whole study; --robot, --task, --methods, "
+        "--variant and --low-level then choose from it (default: none)")  # fmt: skip
+    add("--robot", help="g1 or rby1")
+    add("--task", help="dual_point_touch, box_pick_and_place or non_prehensile_transport")
+    add("--methods", help="methods, with commas between: mpc, mpc_no_sync, mpc_table1, direct, "
+        "direct_amo (default: mpc,direct)")  # fmt: skip
+    add("--variant", help="variants of the methods, with commas between; each is a binding of the "
+        "robot (v1, v2), upright and a preset (conservative, aggressive) with underscores "
+        "between, as v2_upright (default: the robot's own)")  # fmt: skip
+    add("--low-level", help="low-level policies, with commas between: default, falcon, "
+        "diff_drive (default: the robot's own)")  # fmt: skip
+    add("--low-level-path", help="file (amo: folder) of the low-level policy (default: its own)")
+    add("--trials", type=int, help=f"trials of each cell (default: {DEFAULT_TRIALS})")
+    add("--seed", type=int, help="seed of the first trial; the same for every method (default: 0)")
+    add("--noise", help="sensor noise: off, mild or harsh (default: mild)")
+    add("--scene", help="scene (default: the task's own)")
+    add("--fps", type=int, help="rate of the control loop, divides 50 [Hz] (default: 25)")
+    add("--workers", type=int, default=0, help="parallel processes; 0: cores (default: 0)")
+    add("--out", type=Path, default=Path("outputs/eval"),
+        help="folder of the results, by which a study goes on (default: outputs/eval)")  # fmt: skip
+    add("--fresh", action="store_true", help="run every trial again, also those that are there")
+    add("--no-run", action="store_true", help="run nothing, only make tables of what is there")
+    add("--json", type=Path, help="file for the table as a list of objects (default: none)")
+    add("--csv", type=Path, help="file for the table (default: none)")
+    add(
+        "--report", type=Path, help="folder for a page with tables, plots and films (default: none)"
+    )
+    add("--videos", type=int, default=1, help="films of each cell in the report (default: 1)")
+    return parser
+
+
+def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    """Read the command line.
+
+    Raises:
+        BadValue: If a flag is absent or malformed.
+        UnknownName: If a flag is unknown, listing the known ones.
+    """
+    parser = make_parser()
+    args, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        flags = [flag for action in parser._actions for flag in action.option_strings]
+        raise UnknownName("flag of xop-eval", unknown[0], [f for f in flags if f[:2] == "--"])
+    if args.config is None:
+        for name in ("robot", "task"):
+            if getattr(args, name) is None:
+                raise BadValue(f"xop-eval needs --{name}, or a study with --config=FILE")
+    for name in ("workers", "videos"):
+        if getattr(args, name) < 0:
+            raise BadValue(f"--{name} must be 0 or more, got {getattr(args, name)}")
+    if args.fps is not None and (args.fps < 1 or 50 % args.fps):  # noqa: PLR2004
+        raise BadValue(f"--fps must divide the low-level policy's 50 Hz, got {args.fps}")
+    return args
+
+
+def make_study(args: argparse.Namespace) -> list[Any]:
+    """Make the cells that the arguments ask for.
+
+    Raises:
+        UnknownName: If a name is unknown, listing the known ones.
+        BadValue: If nothing is left of a study, or a value is out of its range.
+    """
+    from xop_lerobot.evaluation.study_file import load_study, make_cells  # noqa: PLC0415
+    from xop_lerobot.plant.config import NOISE_PRESETS  # noqa: PLC0415
+
+    if args.noise is not None and args.noise not in NOISE_PRESETS:
+        raise UnknownName("noise preset", args.noise, NOISE_PRESETS)
+    names = ("trials", "seed", "noise", "fps", "scene", "low_level_path")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    lists = {
+        name: None if value is None else [part.strip() for part in value.split(",")]
+        for name, value in (
+            ("methods", args.methods), ("variants", args.variant), ("low_levels", args.low_level)
+        )
+    }  # fmt: skip
+    if args.config is not None:
+        return _choose(load_study(args.config, given), args, lists)
+    group = {
+        "robot": args.robot,
+        "tasks": [args.task],
+        "methods": lists["methods"] or ["mpc", "direct"],
+        "variants": lists["variants"],
+        "low_levels": lists["low_levels"],
+        "trials": DEFAULT_TRIALS,
+        **given,
+    }
+    return make_cells(group)
+
+
+def _choose(
+    cells: list[Any], args: argparse.Namespace, lists: Mapping[str, list[str] | None]
+) -> list[Any]:
+    """Take from a whole study what robot, task, methods, variants and policies name."""
+    wanted = {
+        "robot": None if args.robot is None else [args.robot],
+        "task": None if args.task is None else [args.task],
+        "method": lists["methods"],
+        "variant": lists["variants"],
+        "low_level": lists["low_levels"],
+    }
+    for name, values in wanted.items():
+        known = {getattr(cell.setup, name) for cell in cells}
+        for value in values or ():
+            if value not in known:
+                raise UnknownName(f"{name} of the study", value, known)
+    chosen = [
+        cell
+        for cell in cells
+        if all(v is None or getattr(cell.setup, name) in v for name, v in wanted.items())
+    ]
+    if not chosen:
+        raise BadValue("the study has no cell that fits all of the given names")
+    return chosen
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run what is asked for; returns the exit code."""
+    from xop_lerobot.evaluation.study import Results, collect, plan_jobs, summarise  # noqa: PLC0415
+
+    cells = make_study(args)
+    results = Results(args.out)
+    finished = results.load()
+    jobs = plan_jobs(cells, args.out, () if args.fresh else finished)
+    for cell in cells:
+        if cell.absence:
+            print(f"{describe(cell.setup)}: {cell.absence}", file=sys.stderr)
+    interrupted, failed = False, 0
+    if jobs and not args.no_run:
+        try:
+            failed = _run_jobs(cells, results, jobs, args.workers)
+        except KeyboardInterrupt:
+            interrupted = True
+            print(
+                f"interrupted; what is finished is in '{args.out}', and the same command goes on",
+                file=sys.stderr,
+            )
+    records = results.load()
+    found = [collect(cell, records) for cell in cells]
+    rows = [summarise(cell, trials) for cell, trials in zip(cells, found, strict=True)]
+    _warn_of_mixture(found, args.out)
+    print(format_table(rows))
+    write_tables(rows, args.json, args.csv)
+    if args.report is not None and not interrupted:
+        from xop_lerobot.evaluation.report import write_report  # noqa: PLC0415
+
+        page = write_report(args.report, cells, found, rows, results, args.videos)
+        print(f"report: {page}")
+    if interrupted:
+        return INTERRUPTED
+    if failed:
+        print(f"{failed} trials ended in an error; see '{args.out}'", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _run_jobs(cells: Sequence[Any], results: Any, jobs: Sequence[Any], workers: int) -> int:
+    """Run the jobs with a progress bar; returns how many ended in an error."""
+    from tqdm import tqdm  # noqa: PLC0415
+
+    from xop_lerobot.evaluation.study import run_study  # noqa: PLC0415
+
+    workers = workers or len(os.sched_getaffinity(0))
+    workers = min(workers, len(jobs))
+    failed = 0
+    with tqdm(total=len(jobs), unit="trial", disable=None, smoothing=0.1) as bar:
+        for result in run_study(cells, results, workers, jobs=jobs):
+            job = result.job
+            what = f"{describe(job.setup)}, seed {job.seed}"
+            if result.error:
+                failed += 1
+                text = f"{what}: {result.error.splitlines()[0]}"
+            else:
+                text = f"{what}: {describe_outcome(result.value)}"
+            bar.update()
+            if bar.disable:
+                print(text, file=sys.stderr, flush=True)
+            else:
+                bar.write(text, file=sys.stderr)
+    return failed
+
+
+def describe(setup: Any) -> str:
+    """Robot, task, method, variant and low-level policy in words."""
+    method = f"{setup.method} {setup.variant}".strip()
+    return f"{setup.robot} {setup.task} {method} ({setup.low_level})"
+
+
+def describe_outcome(record: Mapping[str, Any]) -> str:
+    """How a trial ended, in a line."""
+    if record["success"]:
+        text = f"success after {record['completion_s']:.1f} s"
+    else:
+        text = record["failure"] or "time is up"
+    if record["collision"]:
+        text += f", {len(record['collisions'])} collisions"
+    return f"{text} ({record['sim_s']:.0f} s in {record['wall_s']:.0f} s)"
+
+
+def _warn_of_mixture(found: Sequence[Sequence[Mapping[str, Any]]], folder: Path) -> None:
+    """Say so if trials come from several states of the code, or from another than this one."""
+    from xop_lerobot.evaluation.study import compute_code_digest  # noqa: PLC0415
+
+    others = {record["code"] for trials in found for record in trials} - {compute_code_digest()}
+    if others:
+        count = sum(record["code"] in others for trials in found for record in trials)
+        print(
+            f"{count} trials in '{folder}' are of another state of the code "
+            f"({', '.join(sorted(others))}); --fresh runs them again",
+            file=sys.stderr,
+        )
+
+
+def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as text, a line each."""
+    head = ("robot", "task", "method", "low level", "success", "pickup", "collis.", "falls",
+            "CT [s]", "ABP [W]", "tilt [rad]", "jerk [m/s3]", "note")  # fmt: skip
+    lines: list[tuple[str, ...]] = [head]
+    for row in rows:
+        trials = row["trials"]
+        counts = [f"{row[n]}/{trials}" for n in ("success", "pickup", "collision", "falls")]
+        lines.append(
+            (
+                row["robot"],
+                row["task"],
+                f"{row['method']} {row['variant']}".strip(),
+                row["low_level"],
+                *counts,
+                format_spread(row["ct_mean"], row["ct_std"], 1),
+                format_spread(row["abp_mean"], row["abp_std"], 2),
+                format_spread(row["tilt_mean"], row["tilt_std"], 2),
+                format_spread(row["jerk_mean"], row["jerk_std"], 0),
+                row["note"],
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )
+
+
+def format_spread(mean: float | None, std: float | None, digits: int) -> str:
+    """Mean ± standard deviation; a dash without any."""
+    if mean is None or std is None:
+        return "-"
+    return f"{mean:.{digits}f} ± {std:.{digits}f}"
+
+
+def write_tables(
+    rows: Sequence[Mapping[str, Any]], json_file: Path | None, csv_file: Path | None
+) -> None:
+    """Write the rows as JSON and as CSV, where files are given."""
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    if csv_file is not None:
+        csv_file.parent.mkdir(parents=True, exist_ok=True)
+        with csv_file.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            for row in rows:
+                writer.writerow({**row, "seeds": " ".join(map(str, row["seeds"]))})
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `xop-eval`; returns the exit code."""
+    try:
+        return run(parse_arguments(sys.argv[1:] if arguments is None else arguments))
+    except XopError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())
