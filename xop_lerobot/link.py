@@ -22,6 +22,7 @@ from xop_lerobot.state import Goal, RobotState
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
+    from xop_lerobot.retarget.obstacles import Obstacle
     from xop_lerobot.retarget.online import AppliedChange
 
 
@@ -107,6 +108,7 @@ class Session:
         tick: Record of the teleoperator's last tick.
         outcome: Outcome of the task after the last action, None where no task runs.
         view: What a person could see of the robot and its task now, None where no task runs.
+        obstacles: Walls and furniture of the episode, None where no task places any.
         episode: Index of the episode being recorded; the robot's seed depends on it.
         reset_count: Number of robot resets so far; a change tells the teleoperator to re-align.
         configs: Resolved configuration of each part (`robot`, `teleop`), saved with a dataset.
@@ -121,6 +123,7 @@ class Session:
         self.tick: TickRecord | None = None
         self.outcome: Outcome | None = None
         self.view: View | None = None
+        self.obstacles: tuple[Obstacle, ...] | None = None
         self.episode = 0
         self.reset_count = 0
         self.configs: dict[str, Any] = {}
@@ -136,7 +139,7 @@ class Session:
         with self._lock:
             self._robots = [known for known in self._robots if known is not info]
             if not self._robots:
-                self.state = self.tick = self.outcome = self.view = None
+                self._forget()
                 self.episode, self._reset_asked = 0, False
 
     def begin_episode(self, index: int) -> None:
@@ -151,8 +154,11 @@ class Session:
 
     def confirm_reset(self) -> None:
         """Count a reset that the robot has done, and forget what was before it."""
-        self.state = self.tick = self.outcome = self.view = None
+        self._forget()
         self.reset_count += 1
+
+    def _forget(self) -> None:
+        self.state = self.tick = self.outcome = self.view = self.obstacles = None
 
     @property
     def robot(self) -> RobotInfo:

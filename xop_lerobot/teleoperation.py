@@ -28,6 +28,7 @@ from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.obstacle_file import load_obstacles
 from xop_lerobot.retarget.online import AppliedChange, OnlineSettings
 from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.presets import build_configs
@@ -118,9 +119,24 @@ class Teleoperation:
         self.device.disconnect()
         self._follower.close()
 
-    def reset(self) -> None:
-        """Start over, as after a reset of the robot: nobody is engaged, no plan is known."""
+    def reset(self, obstacles: tuple[Obstacle, ...] | None = None) -> None:
+        """Start over, as after a reset of the robot: nobody is engaged, no plan is known.
+
+        Args:
+            obstacles: What stands around the robot now; None where that has not changed.
+        """
+        self.set_obstacles(obstacles)
         self._start_over()
+
+    def set_obstacles(self, obstacles: tuple[Obstacle, ...] | None) -> None:
+        """Take other walls and furniture, from the next solve on; None changes nothing.
+
+        Those of the retargeter's own file of obstacles stay.
+        """
+        if obstacles is None or not self.morphology.hull_points:
+            return
+        path = self.config.retargeter.obstacles
+        self._follower.set_obstacles(obstacles + (load_obstacles(path) if path else ()))
 
     def see(self, view: View | None) -> None:
         """Show the operator the robot and its task, before `step`; None where no task runs."""

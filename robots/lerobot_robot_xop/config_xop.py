@@ -9,6 +9,7 @@ from lerobot.robots.config import RobotConfig
 
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.plant.config import NoiseConfig, SimulationConfig
+from xop_lerobot.tasks.task import get_task
 
 POLICY_HZ = 50
 """Rate of every low-level policy [Hz]; the control loop's rate divides it."""
@@ -19,7 +20,7 @@ CLOCKS = ("lockstep", "realtime")
 class SceneConfig:
     """What is simulated around the robot, and how its sensors err."""
 
-    scene: str = "empty"  # name of the scene that the robot stands in
+    scene: str = ""  # name of the scene that the robot stands in; the task's own, or empty
     noise: str = "off"  # sensor noise: off, mild or harsh
     sensors: NoiseConfig = field(default_factory=NoiseConfig)  # single numbers over the preset's
     viewer_port: int = 8012  # port of the browser view, where there is no display
@@ -40,6 +41,7 @@ class XopRobotConfig(RobotConfig):
     session: str = "default"  # pairs this robot with the teleoperator of the same session
     fps: int = 25  # rate of the control loop [Hz]; divides 50 and equals --dataset.fps
     clock: str = "lockstep"  # lockstep: time passes in send_action alone; realtime: wall clock
+    task: str = ""  # task with its furniture: dual_point_touch, …; none where it is empty
     seed: int = 0  # the same seed gives the same episodes, bit for bit, in lockstep
     cameras: list[str] | str = field(
         default_factory=lambda: ["head"]
@@ -58,7 +60,7 @@ class XopRobotConfig(RobotConfig):
 
         Raises:
             BadValue: If a number is out of its range, with the range.
-            UnknownName: If there is no such clock or noise, with the known ones.
+            UnknownName: If there is no such task, clock or noise, with the known ones.
         """
         if self.fps < 1 or POLICY_HZ % self.fps:
             divisors = [n for n in range(1, POLICY_HZ + 1) if POLICY_HZ % n == 0]
@@ -75,6 +77,17 @@ class XopRobotConfig(RobotConfig):
             raise BadValue(f"robot.cameras names a camera twice: {', '.join(self.cameras)}")
         self.make_simulation_config()
 
+    @property
+    def scene(self) -> str:
+        """Name of the scene that the robot stands in.
+
+        Raises:
+            UnknownName: If there is no such task, with the known ones.
+        """
+        if self.sim.scene or not self.task:
+            return self.sim.scene or "empty"
+        return get_task(self.task).scenes.get(self.morphology, "empty")
+
     def make_simulation_config(self) -> SimulationConfig:
         """Make the configuration of the simulated plant.
 
@@ -83,7 +96,7 @@ class XopRobotConfig(RobotConfig):
             UnknownName: If there is no such noise, with the known ones.
         """
         return SimulationConfig(
-            scene=self.sim.scene,
+            scene=self.scene,
             noise=self.sim.noise,
             sensors=self.sim.sensors,
             seed=self.seed,

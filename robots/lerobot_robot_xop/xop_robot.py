@@ -17,12 +17,14 @@ from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.mistakes import report_mistakes
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_scene_spec
+from xop_lerobot.tasks.camera import add_task_camera
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
     from xop_lerobot.plant.policy_loop import PolicyLoop
     from xop_lerobot.plant.realtime_loop import RealtimeLoop
     from xop_lerobot.plant.simulation import Simulation
+    from xop_lerobot.tasks.stage import Stage
 
 
 class XopRobot(Robot):
@@ -36,7 +38,7 @@ class XopRobot(Robot):
         config: The robot's configuration.
 
     Raises:
-        UnknownName: If there is no such policy for this robot, no such scene or camera.
+        UnknownName: If there is no such policy for this robot, no such task, scene or camera.
         PolicyFileError: If the policy's file is missing or not what it should be.
     """
 
@@ -54,13 +56,14 @@ class XopRobot(Robot):
         self._body = Body(self.morphology)
         self._session = get_session(config.session)
         self._plant: Simulation | None = None
+        self._stage: Stage | None = None
         self._loop: PolicyLoop | RealtimeLoop | None = None
         self._info = RobotInfo(
             name=self.name,
             morphology=self.morphology,
             low_level=policy_name,
             low_level_path=config.low_level.path,
-            scene=config.sim.scene,
+            scene=config.scene,
             fps=config.fps,
             seed=config.seed,
             realtime=config.clock == "realtime",
@@ -111,9 +114,8 @@ class XopRobot(Robot):
             return
         from xop_lerobot.plant.policy_loop import PolicyLoop  # noqa: PLC0415
         from xop_lerobot.plant.realtime_loop import RealtimeLoop  # noqa: PLC0415
-        from xop_lerobot.plant.simulation import Simulation  # noqa: PLC0415
 
-        self._plant = Simulation(self.morphology, self.config.make_simulation_config())
+        self._plant = self._make_plant()
         try:
             loop_class = RealtimeLoop if self._info.realtime else PolicyLoop
             self._loop = loop_class(self.morphology, self._plant, self._policy)
@@ -124,12 +126,28 @@ class XopRobot(Robot):
             self.disconnect()
             raise
 
+    def _make_plant(self) -> Simulation:
+        """Make the simulated robot, with the task's furniture about it where one is asked for."""
+        from xop_lerobot.plant.simulation import Simulation  # noqa: PLC0415
+        from xop_lerobot.tasks.stage import Stage  # noqa: PLC0415
+
+        config = self.config.make_simulation_config()
+        if not self.config.task:
+            return Simulation(self.morphology, config)
+        self._stage = Stage(self.morphology, self.config.task, config)
+        return self._stage.plant
+
     def _start_episode(self) -> None:
-        loop = self._connected_loop
+        loop, stage = self._connected_loop, self._stage
         entropy = np.random.SeedSequence([self.config.seed, self._session.episode])
-        loop.reset(int(entropy.generate_state(1)[0]))
-        self._last_action = self.morphology.rest_action()
+        seed = int(entropy.generate_state(1)[0])
+        start = self.morphology.rest_action() if stage is None else stage.start
+        loop.reset(seed, start=start)
+        self._last_action = start
         self._session.confirm_reset()
+        if stage is not None:
+            stage.reset(seed)
+            self._session.outcome, self._session.obstacles = stage.status, stage.obstacles
 
     @property
     def _connected_loop(self) -> PolicyLoop | RealtimeLoop:
@@ -148,6 +166,8 @@ class XopRobot(Robot):
             self._start_episode()
         state = loop.state
         self._session.state = state
+        if self._stage is not None:
+            self._session.view = self._stage.view(state)
         assert self._plant is not None
         pictures = {camera: self._plant.render(camera) for camera in self.cameras}
         return {**self._body.compute_proprioception(state), **pictures}
@@ -172,12 +192,14 @@ class XopRobot(Robot):
         known = {key: value for key, value in action.items() if key not in sensed}
         wanted = layout.from_dict(known, self._last_action)
         self._last_action = loop.execute(wanted, 1 / self.config.fps)
+        if self._stage is not None:
+            self._session.outcome = self._stage.update()
         return layout.to_dict(self._last_action)
 
     def disconnect(self) -> None:
         """Stop the robot and leave the session; may be called twice."""
         loop, plant = self._loop, self._plant
-        self._loop = self._plant = None
+        self._loop = self._plant = self._stage = None
         if loop is not None:
             loop.close()
         if plant is not None:
@@ -204,7 +226,9 @@ def _check_cameras(morphology: Morphology, config: XopRobotConfig) -> None:
     Raises:
         UnknownName: If there is no such scene or camera, with the known ones.
     """
-    spec = build_scene_spec(morphology, "full", config.sim.scene)
+    spec = build_scene_spec(morphology, "full", config.scene)
+    if config.task:
+        add_task_camera(spec)
     known = [camera.name for camera in spec.cameras]
     for camera in config.cameras:
         if camera not in known:

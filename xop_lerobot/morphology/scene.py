@@ -136,11 +136,23 @@ def add_nothing(spec: mujoco.MjSpec) -> None:
 @SCENES.register("room")
 def add_room(spec: mujoco.MjSpec) -> None:
     """Add four walls of a room of 8 m by 8 m, 2.5 m high."""
+    add_walls(spec, 4.0)
+
+
+@SCENES.register("small_room")
+def add_small_room(spec: mujoco.MjSpec) -> None:
+    """Add four walls of a room of 4.4 m by 4.4 m, 2.5 m high, for tasks in a confined space."""
+    add_walls(spec, 2.2)
+
+
+def add_walls(spec: mujoco.MjSpec, half: float) -> None:
+    """Add the walls of a square room about the origin, `half` [m] from it, 2.5 m high."""
+    middle, outer = half + 0.05, half + 0.1
     walls = (
-        ("front", (4.05, 0), (0.05, 4.1), (0.85, 0.83, 0.78, 1)),
-        ("back", (-4.05, 0), (0.05, 4.1), (0.80, 0.82, 0.85, 1)),
-        ("left", (0, 4.05), (4.0, 0.05), (0.78, 0.84, 0.80, 1)),
-        ("right", (0, -4.05), (4.0, 0.05), (0.86, 0.80, 0.78, 1)),
+        ("front", (middle, 0), (0.05, outer), (0.85, 0.83, 0.78, 1)),
+        ("back", (-middle, 0), (0.05, outer), (0.80, 0.82, 0.85, 1)),
+        ("left", (0, middle), (half, 0.05), (0.78, 0.84, 0.80, 1)),
+        ("right", (0, -middle), (half, 0.05), (0.86, 0.80, 0.78, 1)),
     )
     for name, (x, y), (length, width), colour in walls:
         add_block(spec, f"wall_{name}", (x, y, 1.25), (length, width, 1.25), colour)

@@ -64,11 +64,19 @@ class PolicyLoop:
             settled=bool(np.linalg.norm(measured.qvel[:3]) < _SETTLED_SPEED),
         )
 
-    def reset(self, seed: int | None = None, settle_s: float = 1.0) -> None:
-        """Put the robot at rest and let the policy settle it for `settle_s` [s]."""
+    def reset(
+        self, seed: int | None = None, settle_s: float = 1.0, start: RobotAction | None = None
+    ) -> None:
+        """Put the robot at rest and let the policy settle it for `settle_s` [s].
+
+        Args:
+            seed: Seed of the plant.
+            settle_s: For how long it settles [s].
+            start: What it executes meanwhile; by default it stands at rest.
+        """
         self.plant.reset(seed)
         self._memory = self.policy.initial_memory(1)
-        self.action = _round_action(self.morphology.rest_action())
+        self.action = _round_action(start or self.morphology.rest_action())
         self._measurement = None
         self.advance(settle_s)
         self._collision = self._was_read = False

@@ -55,14 +55,16 @@ class RealtimeLoop:
             self._check()
             return self._loop.state
 
-    def reset(self, seed: int | None = None, settle_s: float = 1.0) -> None:
+    def reset(
+        self, seed: int | None = None, settle_s: float = 1.0, start: RobotAction | None = None
+    ) -> None:
         """Put the robot at rest, let it settle (faster than the clock), then run.
 
         A failure of the loop's thread is forgotten.
         """
         self._halt()
         self._failure = None
-        self._loop.reset(seed, settle_s)
+        self._loop.reset(seed, settle_s, start)
         self._stop.clear()
         self._handed_over = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="xop-policy", daemon=True)

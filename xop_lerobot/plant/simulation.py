@@ -50,6 +50,7 @@ class Simulation(Plant):
         config: Scene, noise, seed, pictures.
         kind: Which of its models to simulate; tests use the planning model to compare with it.
         model: A ready model with the robot first, instead of robot and scene by name.
+        standing: Where `reset` puts the robot, instead of its standing posture. Shape (nq,).
 
     Raises:
         UnknownName: If there is no such scene.
@@ -64,6 +65,7 @@ class Simulation(Plant):
         *,
         kind: ModelKind = "full",
         model: mujoco.MjModel | None = None,
+        standing: np.ndarray | None = None,
     ) -> None:
         self.morphology = morphology
         self.config = config or SimulationConfig()
@@ -81,7 +83,8 @@ class Simulation(Plant):
         self._contacts = ContactTable(model, morphology)
         self._objects = SceneObjects(model, self._contacts.robot_bodies)
         self.nq, self.nv = _compute_robot_size(model, self._contacts.robot_bodies)
-        self._standing = check_vector("standing_qpos", morphology.standing_qpos(), self.nq)
+        standing = morphology.standing_qpos() if standing is None else standing
+        self._standing = check_vector("standing_qpos", standing, self.nq)
         self._sensors = Sensors(
             model, self.nq, self.nv, self.config.resolved_noise, self.config.time_step
         )
@@ -92,6 +95,7 @@ class Simulation(Plant):
         self._num_steps = 0
         self._has_fallen = self._diverged = False
         self._collisions: set[tuple[str, str]] = set()
+        self._touches: set[tuple[str, str]] = set()
         self.reset()
         if self.config.viewer:
             from xop_lerobot.plant.viewer import start_viewer  # noqa: PLC0415 loads a web server
@@ -118,6 +122,7 @@ class Simulation(Plant):
             self._num_steps = 0
             self._has_fallen = self._diverged = False
             self._collisions = self._contacts.find_collisions(self.data)
+            self._touches = set()
             self._sensors.reset(np.random.SeedSequence(entropy), *self._get_true_state())
 
     def measure(self) -> Measurement:
@@ -160,6 +165,7 @@ class Simulation(Plant):
                 self._collisions = set()
             for _ in range(num_steps):
                 self._step_once()
+            self._touches |= self._collisions
             if num_steps:
                 self._update_positions()
             if self._viewer is not None:
@@ -225,6 +231,24 @@ class Simulation(Plant):
             self._has_fallen |= self.fallen
             self._collisions = self._contacts.find_collisions(self.data)
             self._sensors.hold(*self._get_true_state())
+
+    @property
+    def lock(self) -> threading.RLock:
+        """Held while time passes; who reads several things of `data` from a thread holds it."""
+        return self._lock
+
+    def take_touches(self) -> set[tuple[str, str]]:
+        """Every collision since the last call or `reset`, however short, as in `contacts`."""
+        with self._lock:
+            touches, self._touches = self._touches, set()
+        return touches
+
+    def rearrange(self) -> None:
+        """Bring everything up to date after furniture or objects were moved by hand."""
+        with self._lock:
+            mujoco.mj_forward(self.model, self.data)
+            self._collisions = self._contacts.find_collisions(self.data)
+            self._touches = set()
 
     @property
     def object_names(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ import threading
 from typing import Any, NamedTuple
 
 from xop_lerobot.retarget.delay import StatePredictor, predict_goal
+from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.retarget.plan_track import PlanTrack, StampedPlan
 from xop_lerobot.state import Goal, RobotState
@@ -45,6 +46,7 @@ class BackgroundPlanner:
         self._ready = threading.Condition()
         self._job: _Job | None = None
         self._settings: dict[str, Any] | None = None
+        self._obstacles: tuple[Obstacle, ...] | None = None
         self._track = PlanTrack()
         self._reset_to: RobotState | None = None
         self._epoch = self._solved_epoch = 0
@@ -97,6 +99,14 @@ class BackgroundPlanner:
         with self._ready:
             self._settings = (self._settings or {}) | settings
 
+    def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
+        """Give the retargeter other obstacles (`Retargeter.set_obstacles`) before its next solve.
+
+        They are handed over in the solving thread, never in the middle of a solve.
+        """
+        with self._ready:
+            self._obstacles = obstacles
+
     def reset(self, state: RobotState) -> None:
         """Forget all plans, also the one being solved, and failures; start anew from `state`."""
         with self._ready:
@@ -132,12 +142,15 @@ class BackgroundPlanner:
             job, self._job = self._job, None
             reset_to, settings = self._reset_to, self._settings
             self._settings = None
+            obstacles, self._obstacles = self._obstacles, None
             track = self._track.copy()
         if job is None:
             return
         try:
             if settings is not None:
                 self._retargeter.configure(**settings)
+            if obstacles is not None:
+                self._retargeter.set_obstacles(obstacles)
             if job.epoch != self._solved_epoch and reset_to is not None:
                 self._retargeter.reset(reset_to)
                 self._solved_epoch = job.epoch

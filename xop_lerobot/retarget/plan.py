@@ -11,6 +11,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.state import Goal, RobotState
 
 
@@ -84,6 +85,10 @@ class Retargeter(ABC):
     ) -> None:
         """Change settings from the next solve on; nothing for a retargeter that has none."""
         del configs, targets, body, constraints
+
+    def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
+        """Keep clear of these and no others from the next solve on, where it does so at all."""
+        del obstacles
 
     def close(self) -> None:
         """Release threads; may be called twice."""

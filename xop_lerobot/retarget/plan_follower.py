@@ -8,6 +8,7 @@ from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.delay import LatencyMeter, StatePredictor
 from xop_lerobot.retarget.mpc import MpcRetargeter
+from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.retarget.plan_track import StampedPlan
 from xop_lerobot.state import Goal, RobotState
@@ -53,6 +54,10 @@ class PlanFollower:
     def configure(self, **settings: Any) -> None:
         """Give the retargeter other settings from its next solve on."""
         (self.background or self.retargeter).configure(**settings)
+
+    def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
+        """Give the retargeter other obstacles from its next solve on."""
+        (self.background or self.retargeter).set_obstacles(obstacles)
 
     def update(self, state: RobotState, goal: Goal) -> None:
         """Plan where it is due; on the wall clock, ask for it and take the newest there is."""

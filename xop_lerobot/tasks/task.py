@@ -28,11 +28,14 @@ class TaskStatus(Outcome):
         failure: Why the episode is lost, in words; empty while it is not.
         picked_up: Whether the object was held up for long enough.
         figures: Further figures of the episode by name, fit for JSON.
+        collisions: What of the robot touched which wall or piece of furniture so far, other than
+            the hands where the task is for them to.
     """
 
     failure: str = ""
     picked_up: bool = False
     figures: Mapping[str, float] = field(default_factory=dict)
+    collisions: tuple[tuple[str, str], ...] = ()
 
 
 class Task(ABC):
@@ -53,8 +56,25 @@ class Task(ABC):
     scenes: ClassVar[Mapping[str, str]] = {"g1": "empty", "rby1": "room"}
     """Scene by robot, where none is asked for."""
 
+    furniture: tuple[str, ...] = ()
+    """Bodies that stand still and that a robot may run into."""
+    handled: tuple[str, ...] = ()
+    """Those of `furniture` that the hands may touch."""
+    passable: tuple[str, ...] = ()
+    """Geoms of `furniture` over which hands work, so that a planner must not keep clear of them."""
+
     def __init__(self, morphology: Morphology) -> None:
         self.morphology = morphology
+
+    @property
+    def hints(self) -> Mapping[str, float]:
+        """What a person who practised knows about it, by name; lengths in metres."""
+        return {}
+
+    @property
+    def start_arms(self) -> Mapping[str, float]:
+        """Arm joints that are not at rest at the start [rad]."""
+        return {}
 
     @abstractmethod
     def add_to(self, spec: mujoco.MjSpec) -> None:
@@ -87,4 +107,15 @@ def make_task(name: str, morphology: Morphology) -> Task:
     Raises:
         UnknownName: Listing the known tasks.
     """
-    return TASKS[name](morphology)
+    return get_task(name)(morphology)
+
+
+def get_task(name: str) -> type[Task]:
+    """Return the class of the task `name`.
+
+    Raises:
+        UnknownName: Listing the known tasks.
+    """
+    from xop_lerobot.tasks import dual_point_touch  # noqa: F401, PLC0415 it registers itself
+
+    return TASKS[name]

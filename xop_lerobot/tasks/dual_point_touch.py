@@ -1,0 +1,150 @@
+"""Dual-point touch: both palms at points of their own, outside of where the robot stands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.operator.view import SeenObject
+from xop_lerobot.tasks.furniture import add_furniture_body, add_look, get_body_pose, place
+from xop_lerobot.tasks.hold import Hold
+from xop_lerobot.tasks.layout import find_palms, find_room, make_direction, measure_reach
+from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+from xop_lerobot.transforms import quat_from_yaw
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from xop_lerobot.morphology.morphology import Morphology
+    from xop_lerobot.plant.simulation import Simulation
+
+TOLERANCE = 0.05
+"""How near each palm must be to its point [m]."""
+HOLD_S = 3.0
+"""For how long both must be near without a break [s]."""
+BEYOND, FARTHEST = 0.5, 1.6
+"""The middle of the points is at least so much farther than the palms at rest, and at most so far
+from where the robot stands at the start [m]."""
+APART = (0.30, 0.45)
+"""Between the points [m]."""
+HEIGHT_SPREAD = 0.27
+"""Heights of the middle about that of the palms at rest; low ones need a squat [m]."""
+LEVEL_SPREAD, DEPTH_SPREAD = 0.08, 0.04
+"""Largest difference of each point's height and depth from the middle's [m]."""
+FACING_SPREAD = 0.6
+"""By how much the points face aside from where the robot sees them at the start [rad]."""
+NEAR_WALL = (0.25, 0.40)
+"""Distance from a wall, for the points that are near one [m]."""
+WALL_SHARE = 0.5
+"""Share of the trials with points near a wall, in a room."""
+ALONG_WALL = 0.9
+"""How far the middle is aside from the middle of the wall, at most [m]."""
+CLEAR_OF_WALL = 1.0
+"""Least distance to any wall of the stance that points in the open ask for [m]."""
+
+COLOURS = {"left_point": (0.85, 0.16, 0.14, 1), "right_point": (0.13, 0.33, 0.85, 1)}
+GREY = (0.45, 0.46, 0.48, 1)
+RADIUS, ROD = 0.03, 1.5
+"""Of the balls, and the length of the rods that they are on [m]."""
+
+
+@TASKS.register("dual_point_touch")
+class DualPointTouch(Task):
+    """Both palms within 5 cm of their own point, for 3 s without a break.
+
+    The points stand so that a robot which faces them has both before it, as its palms are at
+    rest, at another height. In a room half of them are near a wall.
+    """
+
+    name = "dual_point_touch"
+    instruction = "Touch the red point with the left palm and the blue one with the right."
+    time_limit = 60.0
+    scenes: Mapping[str, str] = {"g1": "empty", "rby1": "small_room"}
+
+    def __init__(self, morphology: Morphology) -> None:
+        super().__init__(morphology)
+        self.reach = measure_reach(morphology)
+        self._hold = Hold(HOLD_S)
+        self._success = False
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add two balls that touch nothing, on thin rods for the eye."""
+        for index, (name, colour) in enumerate(COLOURS.items()):
+            body = add_furniture_body(spec, name, index)
+            add_look(body, name, "sphere", (RADIUS,), (0, 0, 0), colour)
+            # What is under the floor is not seen.
+            add_look(body, f"{name}_rod", "cylinder", (0.004, ROD / 2), (0, 0, -ROD / 2), GREY)
+
+    def bind(self, plant: Simulation) -> None:
+        """Find palms and walls."""
+        self.plant = plant
+        self._palms = find_palms(self.morphology, plant.model)
+        self._room = find_room(plant.model)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Place both points."""
+        near_wall = self._room is not None and rng.random() < WALL_SHARE
+        middle, facing = self._draw_near_wall(rng) if near_wall else self._draw_in_open(rng)
+        middle[2] = self.reach.height + rng.uniform(-HEIGHT_SPREAD, HEIGHT_SPREAD)
+        ahead, left = make_direction(facing), make_direction(facing + math.pi / 2)
+        half = rng.uniform(*APART) / 2
+        depth = 0.0 if near_wall else rng.uniform(-DEPTH_SPREAD, DEPTH_SPREAD)
+        level = rng.uniform(-LEVEL_SPREAD, LEVEL_SPREAD)
+        offset = half * left + depth * ahead + np.array([0, 0, level])
+        for name, sign in (("left_point", 1), ("right_point", -1)):
+            place(self.plant, name, middle + sign * offset, quat_from_yaw(facing))
+        self.facing = facing
+        self._hold.reset()
+        self._success = False
+
+    def _draw_in_open(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+        """Middle and heading, such that a robot has room to stand before them."""
+        while True:
+            bearing = rng.uniform(-math.pi, math.pi)
+            middle = rng.uniform(self.reach.forward + BEYOND, FARTHEST) * make_direction(bearing)
+            facing = bearing + rng.uniform(-FACING_SPREAD, FACING_SPREAD)
+            stance = middle - self.reach.forward * make_direction(facing)
+            if self._room is None:
+                return middle, facing
+            low, high = self._room[0] + NEAR_WALL[1], self._room[1] - NEAR_WALL[1]
+            inside = ((middle[:2] > low) & (middle[:2] < high)).all()
+            clear = np.minimum(stance[:2] - self._room[0], self._room[1] - stance[:2]).min()
+            if inside and clear > CLEAR_OF_WALL:
+                return middle, facing
+
+    def _draw_near_wall(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+        """Middle and heading, straight at one of the four walls."""
+        assert self._room is not None
+        side = int(rng.integers(4))
+        facing = side * math.pi / 2
+        ahead = make_direction(facing)
+        wall = self._room[1] if side < 2 else self._room[0]  # noqa: PLR2004 front, left
+        depth = abs(float(wall @ ahead[:2])) - rng.uniform(*NEAR_WALL)
+        along = rng.uniform(-ALONG_WALL, ALONG_WALL)
+        return depth * ahead + along * make_direction(facing + math.pi / 2), facing
+
+    def compute_distances(self) -> dict[str, float]:
+        """Distance of each palm from its point [m]."""
+        distances = {}
+        for palm, site in self._palms.items():
+            point = palm.replace("_palm", "_point")
+            gap = self.plant.get_site_pose(site)[:3] - get_body_pose(self.plant, point)[:3]
+            distances[palm] = float(np.linalg.norm(gap))
+        return distances
+
+    def update(self) -> TaskStatus:
+        """Both palms near for long enough is success."""
+        distances = self.compute_distances()
+        near = max(distances.values()) <= TOLERANCE
+        self._success |= self._hold.update(self.plant.time, near)
+        figures = {f"{palm}_distance": distance for palm, distance in distances.items()}
+        figures["held_s"] = self._hold.duration
+        return TaskStatus(self._success, self._success, figures=figures)
+
+    @property
+    def objects(self) -> Mapping[str, SeenObject]:
+        """Both points; their X axis is the heading that faces them."""
+        return {name: SeenObject(get_body_pose(self.plant, name)) for name in COLOURS}

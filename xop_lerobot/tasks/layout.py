@@ -1,0 +1,89 @@
+"""Where a robot's hands work well, and how things are laid out about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.morphology.morphology import Morphology
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Where a standing robot has its palms at rest, and how far its arms go.
+
+    Attributes:
+        forward: Palms ahead of the base's frame [m].
+        height: Palms over the floor [m].
+        shoulder: Shoulders over the floor [m].
+        arm: From the shoulder to the palm, arm stretched [m].
+    """
+
+    forward: float
+    height: float
+    shoulder: float
+    arm: float
+
+
+def find_palms(morphology: Morphology, model: mujoco.MjModel) -> dict[str, str]:
+    """Sites of `left_palm` and `right_palm`; the wrist's own where a hand has no palm."""
+    sites = {model.site(i).name for i in range(model.nsite)}
+    palms = {}
+    for arm in morphology.arms:
+        palm = arm.frame.replace("_wrist", "_palm")
+        palms[palm] = palm if palm in sites else morphology.frames[arm.frame]
+    return palms
+
+
+def measure_reach(morphology: Morphology) -> Reach:
+    """Measure a robot at its standing posture."""
+    model = morphology.build_spec("full").compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = morphology.standing_qpos()
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    palms, shoulders, lengths = [], [], []
+    for site, arm in zip(find_palms(morphology, model).values(), morphology.arms, strict=True):
+        palm = data.site_xpos[model.site(site).id]
+        anchors = [data.xanchor[model.joint(joint).id] for joint in arm.joints]
+        path = np.diff([*anchors, palm], axis=0)
+        palms.append(palm)
+        shoulders.append(anchors[0])
+        lengths.append(float(np.linalg.norm(path, axis=1).sum()))
+    base = data.xpos[model.body(morphology.base_body).id]
+    middle = np.mean(palms, axis=0)
+    return Reach(
+        forward=float(middle[0] - base[0]),
+        height=float(middle[2]),
+        shoulder=float(np.mean(shoulders, axis=0)[2]),
+        arm=min(lengths),
+    )
+
+
+def make_direction(angle: float) -> np.ndarray:
+    """Unit vector in the ground's plane, `angle` [rad] to the left of X. Shape (3,)."""
+    return np.array([math.cos(angle), math.sin(angle), 0.0])
+
+
+def find_room(model: mujoco.MjModel) -> np.ndarray | None:
+    """Inner corners of the walls `wall_*`, lower and upper (x, y) [m]; None without walls.
+
+    Shape (2, 2).
+    """
+    walls = {}
+    for side in ("front", "back", "left", "right"):
+        geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"wall_{side}")
+        if geom < 0:
+            return None
+        walls[side] = (model.geom_pos[geom], model.geom_size[geom])
+    (front, front_half), (back, back_half) = walls["front"], walls["back"]
+    (left, left_half), (right, right_half) = walls["left"], walls["right"]
+    return np.array(
+        [
+            [back[0] + back_half[0], right[1] + right_half[1]],
+            [front[0] - front_half[0], left[1] - left_half[1]],
+        ]
+    )

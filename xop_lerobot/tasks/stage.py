@@ -1,0 +1,183 @@
+"""A robot, a task and the furniture about them, simulated: what an episode takes place on."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.command import RobotAction
+from xop_lerobot.morphology.scene import build_scene_spec
+from xop_lerobot.operator.view import View
+from xop_lerobot.plant.config import SimulationConfig
+from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
+from xop_lerobot.tasks.camera import add_task_camera
+from xop_lerobot.tasks.layout import find_palms
+from xop_lerobot.tasks.task import Task, TaskStatus, make_task
+
+if TYPE_CHECKING:
+    from xop_lerobot.morphology.morphology import Morphology
+    from xop_lerobot.state import RobotState
+
+AFTER_SUCCESS_S = 1.0
+"""An episode goes on for so long after its success [s]."""
+
+
+def find_scene(task: Task, scene: str = "") -> str:
+    """Return `scene`, or the one that the task asks for with this robot."""
+    return scene or task.scenes.get(task.morphology.name, "empty")
+
+
+class Stage:
+    """A plant with a task's furniture, and the task that looks at it.
+
+    The policy loop drives `plant` as any other; after each of its resets `reset` places the
+    furniture, and after each control step `update` tells how far the task is. An episode is over
+    a second after its success, when it is lost, when the robot has fallen, or when the task's
+    time is up.
+
+    Args:
+        morphology: The robot.
+        task: Name of the task.
+        config: Settings of the plant. Without any, or with an empty `scene`, the task's own
+            scene for the robot.
+
+    Attributes:
+        plant: The robot among the furniture.
+        task: The task.
+        scene: Name of the scene.
+        start: Action to begin with: the robot at rest, its arms as the task wants them.
+
+    Raises:
+        UnknownName: If there is no such task or scene; lists the known ones.
+    """
+
+    def __init__(
+        self, morphology: Morphology, task: str, config: SimulationConfig | None = None
+    ) -> None:
+        self.morphology, self.task = morphology, make_task(task, morphology)
+        config = config or SimulationConfig(scene="")
+        self.scene = find_scene(self.task, config.scene)
+        spec = build_scene_spec(morphology, "full", self.scene)
+        self.task.add_to(spec)
+        add_task_camera(spec)
+        self.start = _make_start(morphology, self.task)
+        model = spec.compile()
+        self.plant = Simulation(
+            morphology,
+            dataclasses.replace(config, scene=self.scene),
+            model=model,
+            standing=_make_standing(morphology, self.task),
+        )
+        self.task.bind(self.plant)
+        self._sites = {**morphology.frames, **find_palms(morphology, model)}
+        self._hands = _find_hands(self.plant, self._sites)
+        walls = {each.name for each in make_obstacles(model)}
+        self._solid = walls | set(self.task.furniture)
+        self.reset(config.seed)
+
+    def reset(self, seed: int) -> None:
+        """Place everything as `seed` says; to be called after the plant's own reset."""
+        with self.plant.lock:
+            self.task.reset(np.random.default_rng(np.random.SeedSequence([seed, 1])))
+            self.plant.rearrange()
+            self._began = self.plant.time
+            self._success_time: float | None = None
+            self._collisions: set[tuple[str, str]] = set()
+            self.status = self._judge()
+
+    def update(self) -> TaskStatus:
+        """Look at the physics, once per control step."""
+        with self.plant.lock:
+            self._note_touches()
+            self.status = self._judge()
+        return self.status
+
+    @property
+    def time(self) -> float:
+        """Time since the episode began [s]."""
+        return self.plant.time - self._began
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """Walls and furniture, where they stand now, without what hands work over."""
+        with self.plant.lock:
+            known = make_obstacles(self.plant.model, self.task.furniture, self.plant.data)
+        return tuple(each for each in known if each.name not in self.task.passable)
+
+    def view(self, state: RobotState) -> View:
+        """What a person could see now.
+
+        Args:
+            state: The robot's published state.
+        """
+        with self.plant.lock:
+            frames = {name: self.plant.get_site_pose(site) for name, site in self._sites.items()}
+            objects = dict(self.task.objects)
+        return View(
+            time=state.time,
+            task=self.task.name,
+            frames=frames,
+            objects=objects,
+            mode=state.mode,
+            fallen=state.fallen,
+            success=self.status.success,
+        )
+
+    def close(self) -> None:
+        """Close the plant; may be called twice."""
+        self.plant.close()
+
+    def _note_touches(self) -> None:
+        """Take down what of the robot has run into what."""
+        handled = set(self.task.handled)
+        for part, other in self.plant.take_touches():
+            if other in self._solid and not (part in self._hands and other in handled):
+                self._collisions.add((part, other))
+
+    def _judge(self) -> TaskStatus:
+        """The task's word, and whether the episode is over."""
+        time, fallen = self.plant.time, self.plant.has_fallen
+        collisions = tuple(sorted(self._collisions))
+        status = dataclasses.replace(self.task.update(), collisions=collisions)
+        if fallen and not status.failure:
+            status = dataclasses.replace(status, failure="the robot fell")
+        failed = bool(status.failure) and self._success_time is None
+        if status.success and not failed and self._success_time is None:
+            self._success_time = time
+        won = self._success_time is not None
+        over = failed or self.time >= self.task.time_limit
+        if won:
+            over = time - self._success_time >= AFTER_SUCCESS_S
+        return dataclasses.replace(status, success=won, done=over)
+
+
+def _make_start(morphology: Morphology, task: Task) -> RobotAction:
+    """Action at rest, with the arms as the task wants them at the start."""
+    rest = morphology.rest_action()
+    arms = rest.arms.copy()
+    for name, angle in task.start_arms.items():
+        arms[morphology.arm_names.index(name)] = angle
+    return dataclasses.replace(rest, arms=arms)
+
+
+def _make_standing(morphology: Morphology, task: Task) -> np.ndarray:
+    """Standing posture, with the arms as the task wants them. Shape (nq,)."""
+    standing = morphology.standing_qpos()
+    if task.start_arms:
+        model = morphology.build_spec("planning").compile()
+        for name, angle in task.start_arms.items():
+            standing[model.joint(name).qposadr[0]] = angle
+    return standing
+
+
+def _find_hands(plant: Simulation, sites: dict[str, str]) -> set[str]:
+    """Bodies that carry the palms, and all that hang on them."""
+    model = plant.model
+    hands = {int(model.site(sites[palm]).bodyid[0]) for palm in sites if palm.endswith("_palm")}
+    for body in range(model.nbody):
+        if int(model.body_parentid[body]) in hands:
+            hands.add(body)
+    return {model.body(body).name for body in hands}
