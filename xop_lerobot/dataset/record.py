@@ -27,8 +27,7 @@ from lerobot.datasets import (
 from lerobot.processor import make_default_processors
 from lerobot.robots import Robot
 from lerobot.scripts.lerobot_record import RecordConfig
-from lerobot.utils.constants import ACTION, OBS_STR
-from lerobot.utils.feature_utils import build_dataset_frame, combine_feature_dicts
+from lerobot.utils.feature_utils import combine_feature_dicts
 from lerobot.utils.import_utils import (
     make_device_from_device_class,
     register_third_party_plugins,
@@ -47,6 +46,7 @@ from lerobot_teleoperator_xop import XopConfig
 from lerobot_teleoperator_xop.terminal import listen_while_recording
 from xop_lerobot.dataset.host import count_ticks
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
+from xop_lerobot.dataset.tick import run_tick
 from xop_lerobot.dataset.xop_dataset import XopDataset
 from xop_lerobot.errors import BadValue, XopError
 
@@ -127,16 +127,9 @@ class Recording:
 
     def run_tick(self) -> None:
         """Observe, decide, act, record."""
-        config, features = self.config, self.dataset.features
-        observation = self.robot.get_observation()
-        action = self.teleop.get_action()
-        self.robot.send_action(action)
-        self.dataset.add_frame(
-            {
-                **build_dataset_frame(features, observation, prefix=OBS_STR),
-                **build_dataset_frame(features, action, prefix=ACTION),
-                "task": config.dataset.single_task,
-            }
+        config = self.config
+        observation, action = run_tick(
+            self.robot, self.teleop, self.dataset, config.dataset.single_task
         )
         if config.display_data:
             log_visualization_data(
