@@ -20,7 +20,6 @@ from xop_lerobot.transforms import (
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
-    wrap_angle,
 )
 
 SIDES = ("left", "right")
@@ -32,6 +31,8 @@ PINCH_RAMP = 0.09
 """Time in which thumb and index close, and open [s]."""
 DOUBLE_PINCH_S = 0.75
 """Length of a double pinch [s]."""
+HALT_S = 0.7
+"""Time in which a walk or a turn that is broken off comes to rest [s]."""
 RELAXED = (0.30, 0.22, -0.50)
 """Left hand held in front: from the head, forward, left, up [m], for eyes at 1.6 m."""
 STEP_HZ = 1.6
@@ -100,6 +101,7 @@ class Body:
         )
         self._start = self._end = self.posture
         self._began, self._duration, self._ramp = 0.0, 0.0, 0.0
+        self._braking = False
         self._pinched_at: dict[str, float] = {}
         self._walked = self._speed = 0.0
         self.time = 0.0
@@ -119,17 +121,26 @@ class Body:
         self._begin(end, duration, 0.0)
 
     def walk(self, end: Posture) -> None:
-        """Begin to walk straight to `end`, evenly but for the start and the stop."""
+        """Begin to walk straight to `end`, evenly but for the start and the stop.
+
+        Headings count as they are, so a turn may be more than half a circle.
+        """
         way = float(np.linalg.norm(end.place[:2] - self.posture.place[:2]))
-        turn = abs(float(wrap_angle(end.place[2] - self.posture.place[2])))
+        turn = abs(float(end.place[2] - self.posture.place[2]))
         person = self._person
-        # With minimum jerk at both ends, half of the ramps is lost.
-        walking = way / person.walk_speed + person.walk_start
-        turning = 1.875 * turn / person.turn_speed
-        if turning >= walking:
-            self._begin(end, turning, 0.0)
-        else:
-            self._begin(end, walking, person.walk_start)
+        # Half of the way of each ramp is lost against even speed.
+        even = max(way / person.walk_speed, turn / person.turn_speed)
+        self._begin(end, even + person.walk_start, person.walk_start)
+
+    def halt(self) -> None:
+        """Break a walk or turn off, and come to rest within `HALT_S`."""
+        if not self.is_moving:
+            return
+        later = self._compute_posture(self.time + 0.01)
+        rate = (later.place - self.posture.place) / 0.01
+        end = replace(self.posture, place=self.posture.place + 0.5 * HALT_S * rate)
+        self._begin(end, HALT_S, 0.0)
+        self._braking = True
 
     def double_pinch(self, *sides: str) -> None:
         """Begin to pinch twice with thumb and index of the hands named."""
@@ -140,7 +151,7 @@ class Body:
         """Go on to `time` [s] of the person's clock."""
         dt, self.time = time - self.time, time
         last = self.posture.place[:2]
-        self.posture = self._compute_posture()
+        self.posture = self._compute_posture(time)
         if dt > 0:
             step = float(np.linalg.norm(self.posture.place[:2] - last))
             self._walked += step
@@ -189,24 +200,23 @@ class Body:
     def _begin(self, end: Posture, duration: float, ramp: float) -> None:
         self._start, self._end = self.posture, end
         self._began, self._duration, self._ramp = self.time, max(duration, 0.05), ramp
+        self._braking = False
 
-    def _compute_posture(self) -> Posture:
+    def _compute_posture(self, time: float) -> Posture:
         if not self._duration:
             return self.posture
-        u = (self.time - self._began) / self._duration
+        u = (time - self._began) / self._duration
         if u >= 1:
             return self._end
-        share = _compute_ramped(u, self._ramp / self._duration) if self._ramp else None
+        if self._braking:
+            way = 2 * u - 2 * u**3 + u**4  # from even speed to rest
+        elif self._ramp:
+            way = _compute_ramped(u, self._ramp / self._duration)
+        else:
+            way = compute_minimum_jerk(u)
         u = compute_minimum_jerk(u)
         start, end = self._start, self._end
-        turn = float(wrap_angle(end.place[2] - start.place[2]))
-        way = u if share is None else share
-        place = np.array(
-            [
-                *(start.place[:2] + way * (end.place[:2] - start.place[:2])),
-                start.place[2] + u * turn,
-            ]
-        )
+        place = start.place + way * (end.place - start.place)
         return Posture(
             place=place,
             drop=start.drop + u * (end.drop - start.drop),

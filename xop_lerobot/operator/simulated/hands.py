@@ -15,6 +15,7 @@ from xop_lerobot.transforms import (
     pose_multiply,
     quat_from_matrix,
     quat_from_yaw,
+    quat_multiply,
     quat_rotate,
     quat_to_rpy,
 )
@@ -25,6 +26,10 @@ LARGEST_NOD = 0.5
 """Largest nod [rad]."""
 SHOULDER = (-0.08, 0.18, -0.28)
 """Left shoulder from the eyes, forward, left, up [m], for eyes at 1.6 m."""
+ARM = (0.30, 0.26)
+"""Upper arm and forearm [m]."""
+HAND = 0.1
+"""From the wrist to the middle of the palm [m]."""
 
 
 def compute_reach_time(mind: Mind, distance: float) -> float:
@@ -98,21 +103,37 @@ def compute_wrist(mind: Mind, side: str, palm: np.ndarray, quat: np.ndarray) -> 
 
 
 def compute_pointing(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
-    """How a hand is turned that goes for a point: along the arm, palm inwards. Shape (4,)."""
-    left = 1.0 if side == "left" else -1.0
-    own = mind.body.compute_head()
-    frame = mind.body.posture.compute_frame(mind.person.eye_height)
-    shoulder = frame[:3] + quat_rotate(
-        frame[3:], np.array(SHOULDER) * [1, left, 1] * mind.person.eye_height / 1.6
-    )
-    reach = point - mind.belief.point_to_robot(shoulder, own)
-    turn = quat_from_yaw(mind.belief.turn + float(mind.body.posture.place[2]))
-    ahead = quat_rotate(turn, np.array([1.0, 0, 0]))
-    # The wrist bends some of the way from straight ahead to along the arm.
-    forward = _unit(ahead + _unit(reach))
-    outwards = quat_rotate(turn, np.array([0, left, 0]))
-    up = _unit(outwards - (outwards @ forward) * forward)
-    return quat_from_matrix(np.column_stack([forward, np.cross(up, forward), up]))
+    """How a hand is turned that goes for a point: straight on the forearm, palm inwards. (4,).
+
+    The forearm follows from the own arm: two links from shoulder to wrist, elbow down and a
+    little out.
+    """
+    left, size = (1.0 if side == "left" else -1.0), mind.person.eye_height / 1.6
+    body, belief = mind.body, mind.belief
+    frame = body.posture.compute_frame(mind.person.eye_height)
+    back = pose_inverse(frame)
+    target = _apply(back, belief.point_to_own(point, body.compute_head())) / size
+    shoulder = np.array(SHOULDER) * [1, left, 1]
+    pole = np.array([-0.2, 0.35 * left, -1.0])
+    forearm = np.array([1.0, 0, 0])
+    for _ in range(5):  # the wrist is where the hand, straight on the forearm, ends at the point
+        elbow = _place_elbow(shoulder, target - HAND * forearm, pole)
+        forearm = _unit(target - elbow)
+    outwards = np.array([0, left, 0])
+    up = _unit(outwards - (outwards @ forearm) * forearm)
+    quat = quat_from_matrix(np.column_stack([forearm, np.cross(up, forearm), up]))
+    return quat_multiply(quat_from_yaw(belief.turn + float(body.posture.place[2])), quat)
+
+
+def _place_elbow(shoulder: np.ndarray, wrist: np.ndarray, pole: np.ndarray) -> np.ndarray:
+    """Elbow of two links from shoulder to wrist, towards the pole. Shape (3,)."""
+    upper, fore = ARM
+    line = wrist - shoulder
+    length = float(np.clip(np.linalg.norm(line), 0.1, 0.99 * (upper + fore)))
+    along = _unit(line)
+    down = _unit(pole - (pole @ along) * along)
+    share = (length**2 + upper**2 - fore**2) / (2 * length)
+    return shoulder + share * along + np.sqrt(max(upper**2 - share**2, 0.0)) * down
 
 
 def reach(mind: Mind, wrists: Mapping[str, np.ndarray], slowness: float = 1.0) -> Doing:
@@ -158,6 +179,10 @@ def move_hands(mind: Mind, goals: Mapping[str, np.ndarray], slowness: float = 1.
 def compute_errors(mind: Mind, points: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What each palm is seen to miss its point by, robot's world [m]. Shapes (3,)."""
     return {side: point - mind.feel(f"{side}_palm")[:3] for side, point in points.items()}
+
+
+def _apply(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
+    return pose[:3] + quat_rotate(pose[3:], point)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

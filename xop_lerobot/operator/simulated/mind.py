@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from xop_lerobot.command import Mode
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.operator.simulated.belief import Belief
@@ -92,6 +93,12 @@ class Mind:
         """Frame of the body as it is now."""
         return self.body.make_frame(stamp)
 
+    def is_still(self, *names: str) -> bool:
+        """Whether the robot's frames are seen to stand still, or to mark time on the spot."""
+        walking = self.eyes.mode is Mode.MOBILE
+        limit = self.person.still_walking if walking else self.person.still
+        return self.eyes.compute_movement(names) <= limit
+
     def pause(self, duration: float) -> Doing:
         """Stay as one is for `duration` [s]."""
         end = self.time + duration
@@ -113,7 +120,7 @@ class Mind:
         watched = names or ("head", "left_wrist", "right_wrist")
         yield from self.pause(self.person.delay)
         limit = self.time + (self.person.patience if patience is None else patience)
-        while self.time < limit and self.eyes.compute_movement(watched) > self.person.still:
+        while self.time < limit and not self.is_still(*watched):
             yield
         yield from self.pause(self.person.decision_s)
         self.belief.learn(self.body.compute_head(), self.eyes.pose("head"), self.person.gain)

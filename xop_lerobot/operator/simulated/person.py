@@ -41,6 +41,7 @@ class Person:
         hand_gain: The same of a hand.
         patience: Longest wait until what is seen stands still [s].
         still: Movement in 0.4 s below which a thing stands still [m].
+        still_walking: The same in mobile mode, where a legged robot marks time [m].
         place_tolerance: How far beside where a person wants to stand is good enough [m].
         heading_tolerance: The same of the heading [rad].
         hand_tolerance: Distance from palm to point that is good enough [m].
@@ -65,7 +66,7 @@ class Person:
     fitts_a: float = 0.013
     fitts_b: float = 0.095
     care: float = 2.0
-    hand_speed: float = 0.4
+    hand_speed: float = 0.3
     hand_width: float = 0.05
     posture_speed: float = 0.16
     walk_speed: float = 0.55
@@ -77,6 +78,7 @@ class Person:
     hand_gain: float = 0.75
     patience: float = 1.5
     still: float = 0.008
+    still_walking: float = 0.03
     place_tolerance: float = 0.07
     heading_tolerance: float = 0.12
     hand_tolerance: float = 0.028

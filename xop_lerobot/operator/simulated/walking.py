@@ -12,12 +12,8 @@ from xop_lerobot.operator.simulated.body import Posture, relaxed_hands
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
 from xop_lerobot.transforms import wrap_angle
 
-GLANCES = (0.7, -0.7)
-"""Turns of the head with which a person looks about [rad]."""
-BODY_TURN = 1.4
-"""Turn of the body at a time, for what is not beside either [rad]."""
-MOST_TURNS = 5
-"""How many of them a person makes before giving up."""
+LAG = 0.4
+"""How long a person still looks when the own turn is over: the robot may be behind [s]."""
 MODE_WAIT = 1.4
 """Longest wait for the display to show the other mode [s]."""
 MODE_TRIES = 6
@@ -27,26 +23,20 @@ TURN_FIRST = 0.35
 
 
 def find(mind: Mind, *names: str) -> Doing:
-    """Look about until each thing was seen, first with the head, then with the body."""
+    """Look; what is not in view is behind, so turn round on the spot until it is."""
     while mind.eyes.is_blind:
         yield
-    yield from mind.settle()
+    yield from mind.pause(mind.person.decision_s)
     if _knows(mind, names):
         return
-    mind.note("look about")
-    for glance in GLANCES:
-        yield from _turn_head(mind, glance, names)
-        if _knows(mind, names):
-            return
-    yield from _turn_head(mind, 0.0)
+    mind.note("turn round to look")
     yield from set_mode(mind, Mode.MOBILE)
-    for _ in range(MOST_TURNS):
-        posture = mind.body.posture
-        mind.body.walk(replace(posture, place=posture.place + np.array([0, 0, BODY_TURN])))
-        yield from _search(mind, names)
-        if _knows(mind, names):
-            return
-    raise GaveUp(f"did not find {', '.join(names)}")
+    round_about = mind.rng.choice([-1, 1]) * np.array([0, 0, 2 * np.pi])
+    posture = mind.body.posture
+    mind.body.walk(replace(posture, place=posture.place + round_about))
+    yield from _search(mind, names)
+    if not _knows(mind, names):
+        raise GaveUp(f"did not find {', '.join(names)}")
 
 
 def set_mode(mind: Mind, mode: Mode) -> Doing:
@@ -122,7 +112,9 @@ def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, *, straight: bool) 
         body.posture, drop=0.0, lean=np.zeros(2), look=np.zeros(2), hands=hands.copy()
     )
     changed = body.posture.drop + float(np.abs(body.posture.lean).sum())
-    if changed > 0.01 or not np.allclose(body.posture.hands, hands, atol=1e-3):
+    if changed + float(np.abs(body.posture.look).sum()) > 0.01 or not np.allclose(
+        body.posture.hands, hands, atol=1e-3
+    ):
         body.move(upright, max(0.8, changed / person.posture_speed))
         yield from mind.finish()
     way = target[:2] - body.posture.place[:2]
@@ -143,27 +135,23 @@ def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, *, straight: bool) 
 
 
 def _at(mind: Mind, x: float, y: float, yaw: float) -> Posture:
-    return replace(mind.body.posture, place=np.array([x, y, yaw]))
-
-
-def _turn_head(mind: Mind, angle: float, names: tuple[str, ...] = ()) -> Doing:
-    posture = mind.body.posture
-    look = np.array([angle, posture.look[1]])
-    turn = abs(angle - posture.look[0])
-    mind.body.move(replace(posture, look=look), 1.875 * turn / mind.person.turn_speed)
-    if names:
-        yield from _search(mind, names)
-    else:
-        yield from mind.settle("head")
+    """The posture at another place, turned the shorter way."""
+    last = mind.body.posture
+    turn = float(wrap_angle(yaw - last.place[2]))
+    return replace(last, place=np.array([x, y, last.place[2] + turn]))
 
 
 def _search(mind: Mind, names: tuple[str, ...]) -> Doing:
-    """Wait for the turn that is under way, or until all is seen; the turn then comes to rest."""
-    yield from mind.finish()
-    limit = mind.time + mind.person.patience
+    """Look while turning; what comes into view ends the turn."""
+    while mind.body.is_moving:
+        if _knows(mind, names):
+            yield from mind.pause(mind.person.decision_s)
+            mind.body.halt()
+            yield from mind.settle("head")
+            return
+        yield
+    limit = mind.time + mind.person.delay + LAG
     while mind.time < limit and not _knows(mind, names):
-        if mind.eyes.compute_movement(("head",)) <= mind.person.still:
-            break
         yield
 
 
