@@ -55,12 +55,15 @@ def make_parser() -> argparse.ArgumentParser:
         "between, as v2_upright (default: the robot's own)")  # fmt: skip
     add("--low-level", help="low-level policies, with commas between: default, falcon, "
         "diff_drive (default: the robot's own)")  # fmt: skip
-    add("--low-level-path", help="file (amo: folder) of the low-level policy (default: its own)")
+    add("--low-level-path", help="files of low-level policies, as falcon=FILE,amo=FOLDER "
+        "(default: their own)")  # fmt: skip
     add("--trials", type=int, help=f"trials of each cell (default: {DEFAULT_TRIALS})")
     add("--seed", type=int, help="seed of the first trial; the same for every method (default: 0)")
     add("--noise", help="sensor noise: off, mild or harsh (default: mild)")
     add("--scene", help="scene (default: the task's own)")
     add("--fps", type=int, help="rate of the control loop, divides 50 [Hz] (default: 25)")
+    add("--time-limit", type=float,
+        help="time after which an episode is cut off [s] (default: the task's own)")  # fmt: skip
     add("--workers", type=int, default=0, help="parallel processes; 0: cores (default: 0)")
     add("--out", type=Path, default=Path("outputs/eval"),
         help="folder of the results, by which a study goes on (default: outputs/eval)")  # fmt: skip
@@ -94,6 +97,8 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     for name in ("workers", "videos"):
         if getattr(args, name) < 0:
             raise BadValue(f"--{name} must be 0 or more, got {getattr(args, name)}")
+    if args.time_limit is not None and not args.time_limit > 0:
+        raise BadValue(f"--time-limit must be above 0 s, got {args.time_limit}")
     if args.fps is not None and (args.fps < 1 or 50 % args.fps):  # noqa: PLR2004
         raise BadValue(f"--fps must divide the low-level policy's 50 Hz, got {args.fps}")
     return args
@@ -111,8 +116,10 @@ def make_study(args: argparse.Namespace) -> list[Any]:
 
     if args.noise is not None and args.noise not in NOISE_PRESETS:
         raise UnknownName("noise preset", args.noise, NOISE_PRESETS)
-    names = ("trials", "seed", "noise", "fps", "scene", "low_level_path")
+    names = ("trials", "seed", "noise", "fps", "time_limit", "scene")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    if args.low_level_path is not None:
+        given["low_level_paths"] = _parse_paths(args.low_level_path)
     lists = {
         name: None if value is None else [part.strip() for part in value.split(",")]
         for name, value in (
@@ -131,6 +138,17 @@ def make_study(args: argparse.Namespace) -> list[Any]:
         **given,
     }
     return make_cells(group)
+
+
+def _parse_paths(text: str) -> dict[str, str]:
+    """Read `name=path` with commas between."""
+    paths = {}
+    for part in text.split(","):
+        name, equals, path = (piece.strip() for piece in part.partition("="))
+        if not (name and equals and path):
+            raise BadValue(f"--low-level-path must be NAME=PATH, got '{part}'")
+        paths[name] = path
+    return paths
 
 
 def _choose(

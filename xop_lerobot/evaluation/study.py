@@ -83,19 +83,32 @@ def make_cell(setup: TrialSetup, trials: int, seed: int = 0) -> Cell:
     return Cell(setup, trials, seed, _find_absence(setup.low_level, setup.low_level_path))
 
 
-_find_absence = cache(find_absence)
+@cache
+def _find_absence(low_level: str, path: str) -> str:
+    return find_absence(low_level, path)
 
 
 def compute_key(setup: TrialSetup, seed: int) -> str:
     """A name of the trial that changes with any of its settings."""
     plain = dataclasses.asdict(dataclasses.replace(setup, low_level_path=""))
     if setup.low_level_path:  # where it lies tells nothing, what it holds does
-        content = Path(setup.low_level_path).expanduser().read_bytes()
-        plain["low_level_path"] = hashlib.sha256(content).hexdigest()
+        plain["low_level_path"] = _digest_path(setup.low_level_path)
     text = json.dumps(plain, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
     parts = (setup.robot, setup.task, setup.method, setup.variant, setup.low_level)
     return f"{'-'.join(part for part in parts if part)}-{seed}-{digest}"
+
+
+@cache
+def _digest_path(path: str) -> str:
+    """SHA-256 of a file, or of all files of a folder."""
+    place = Path(path).expanduser()
+    files = sorted(place.iterdir()) if place.is_dir() else [place]
+    digest = hashlib.sha256()
+    for file in files:
+        if file.is_file():
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 @cache
@@ -186,7 +199,7 @@ def run_job(job: Job) -> dict[str, Any]:
     partial = path.with_suffix(".part.npz")
     np.savez_compressed(
         partial,
-        dt=film.dt,
+        fps=film.fps,
         qpos=film.qpos,
         mocap_pos=film.mocap_pos,
         mocap_quat=film.mocap_quat,

@@ -14,21 +14,22 @@ from xop_lerobot.evaluation.methods import get_method
 from xop_lerobot.evaluation.study import Cell, make_cell
 from xop_lerobot.evaluation.trial import TrialSetup
 
-_STUDY_KEYS = ("trials", "seed", "noise", "fps", "groups")
+_STUDY_KEYS = ("trials", "seed", "noise", "fps", "time_limit", "low_level_paths", "groups")
 _LISTS = ("tasks", "methods", "variants", "low_levels")
-_GROUP_KEYS = ("robot", *_LISTS, "trials", "noise", "scene", "low_level_path")
+_GROUP_KEYS = ("robot", *_LISTS, "trials", "noise", "scene")
 
 
 def load_study(path: Path, overrides: Mapping[str, Any] | None = None) -> list[Cell]:
     """Read the cells of a study.
 
     Args:
-        path: YAML file: `trials`, `seed`, `noise`, `fps`, and a list of `groups`; each has a
+        path: YAML file: `trials`, `seed`, `noise`, `fps`, `time_limit`, `low_level_paths` (file
+            or folder of a low-level policy by its name), and a list of `groups`; each has a
             `robot` and lists of `tasks` and `methods`, and may have lists of `variants` and
             `low_levels`, and `trials`, `noise` and `scene` of its own. Every combination within
             a group is a cell.
         overrides: Values over those of the file and of all its groups (`trials`, `seed`,
-            `noise`, `fps`); None leaves a value.
+            `noise`, …); None leaves a value.
 
     Raises:
         BadValue: If the file is missing or malformed.
@@ -67,8 +68,9 @@ def make_cells(group: Mapping[str, Any]) -> list[Cell]:
         UnknownName: If a name is unknown, listing the known ones.
         BadValue: If a number is out of its range.
     """
-    kept = ("noise", "scene", "fps", "low_level_path")
+    kept = ("noise", "scene", "fps", "time_limit")
     common = {name: group[name] for name in kept if group.get(name)}
+    paths = group.get("low_level_paths") or {}
     combinations = product(
         group["tasks"],
         _get_list(group, "low_levels"),
@@ -78,14 +80,15 @@ def make_cells(group: Mapping[str, Any]) -> list[Cell]:
     cells: dict[TrialSetup, Cell] = {}
     for task, low_level, method, variant in combinations:
         own = get_method(method).low_level
-        settings = {name: v for name, v in common.items() if not (own and name == "low_level_path")}
+        policy = own or low_level or ""
         setup = TrialSetup(
             group["robot"],
             task,
             method,
             variant or "",
-            low_level="" if own else low_level or "",
-            **settings,
+            low_level=policy,
+            low_level_path=str(paths.get(policy, "")),
+            **common,
         )
         cell = make_cell(setup, group.get("trials", 20), group.get("seed", 0))
         cells.setdefault(cell.setup, cell)

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 GRACE_S = 5.0
 """How far over its task's time limit an episode may run before it is cut off [s]."""
+FILM_HZ = 25
+"""Most pictures per second of a film [Hz]."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class TrialSetup:
         noise: Preset of the sensors' noise.
         scene: Scene; empty for the task's own.
         fps: Rate of the control loop [Hz].
+        time_limit: Time after which the episode is cut off, if its task has not ended it [s];
+            0 for the task's own limit.
     """
 
     robot: str
@@ -58,6 +62,7 @@ class TrialSetup:
     noise: str = "mild"
     scene: str = ""
     fps: int = 25
+    time_limit: float = 0.0
 
     @property
     def resolved(self) -> TrialSetup:
@@ -113,13 +118,13 @@ class Film:
     """Positions of everything in the scene, from which pictures can be made later.
 
     Attributes:
-        dt: Time between pictures [s].
+        fps: Pictures per second [Hz].
         qpos: Positions of robot and objects. Shape (p, nq of the scene), float32.
         mocap_pos: Places of the furniture. Shape (p, m, 3), float32.
         mocap_quat: Orientations of the furniture, wxyz. Shape (p, m, 4), float32.
     """
 
-    dt: float
+    fps: int
     qpos: np.ndarray
     mocap_pos: np.ndarray
     mocap_quat: np.ndarray
@@ -200,12 +205,12 @@ class _Rows:
 
 
 class _Filming:
-    """Notes the positions of the whole scene, at half the rate of the control loop or so."""
+    """Notes the positions of the whole scene, 25 times a second or less."""
 
     def __init__(self, stage: Stage, fps: int) -> None:
         self._data = stage.plant.data
-        self._every = max(1, round(fps / 12.5))
-        self.dt = self._every / fps
+        self._every = max(1, fps // FILM_HZ)
+        self.fps = fps // self._every
         self._count = 0
         self._rows: list[tuple[np.ndarray, ...]] = []
 
@@ -223,7 +228,7 @@ class _Filming:
 
     def make_film(self) -> Film:
         """Put the pictures together."""
-        return Film(self.dt, *(np.stack(column) for column in zip(*self._rows, strict=True)))
+        return Film(self.fps, *(np.stack(column) for column in zip(*self._rows, strict=True)))
 
 
 def make_stage(setup: TrialSetup, seed: int) -> Stage:
@@ -263,6 +268,7 @@ def run_trial(
     setup = setup.resolved
     stage = make_stage(setup, seed)
     policy = make_policy(setup.low_level, setup.low_level_path or None)
+    policy.adapt(stage.plant.model)
     loop = PolicyLoop(stage.plant.morphology, stage.plant, policy)
     teleoperation = make_teleoperation(setup, seed, stage.plant.morphology)
     try:
@@ -288,7 +294,7 @@ def _drive(
     """Close the loop until the task is over."""
     rows, filming = _Rows(), _Filming(stage, setup.fps)
     dt, start = 1 / setup.fps, loop.state.time
-    limit = TASKS[setup.task].time_limit + GRACE_S
+    limit = setup.time_limit or TASKS[setup.task].time_limit + GRACE_S
     engaged_at = succeeded_at = float("nan")
     while True:
         state = loop.state
@@ -306,7 +312,7 @@ def _drive(
         if status.success and np.isnan(succeeded_at):
             succeeded_at = loop.state.time
         gave_up = teleoperation.device.is_finished(loop.state.time) and not status.success
-        if status.done or gave_up or loop.state.time - start > limit:
+        if status.done or gave_up or loop.state.time - start >= limit - dt / 2:
             break
     if gave_up and not status.failure:
         status = dataclasses.replace(status, failure="the person gave up")

@@ -202,7 +202,17 @@ def make_record(trial: Trial) -> dict[str, Any]:
     }
 
 
-_SETTINGS = ("robot", "task", "method", "variant", "low_level", "noise", "scene", "fps")
+_SETTINGS = (
+    "robot",
+    "task",
+    "method",
+    "variant",
+    "low_level",
+    "noise",
+    "scene",
+    "fps",
+    "time_limit",
+)
 
 
 def _to_json(value: float) -> float | None:

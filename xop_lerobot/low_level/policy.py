@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.registry import Registry
+
+if TYPE_CHECKING:
+    import mujoco
 
 POLICY_DT = 0.02
 """Period of every low-level policy [s] (50 Hz)."""
@@ -38,6 +41,13 @@ class LowLevelPolicy(ABC):
 
     name: str
     memory_size: int
+
+    def adapt(self, model: mujoco.MjModel) -> None:
+        """Give `model`, of a plant, the motors that the policy was trained with.
+
+        Nothing by default: the robots' models have the gains of their own policies.
+        """
+        del model
 
     @abstractmethod
     def initial_memory(self, n: int = 1) -> np.ndarray:
@@ -84,6 +94,6 @@ def make_policy(name: str, path: str | None = None) -> LowLevelPolicy:
         PolicyFileError: If the file is missing, altered or of the wrong shape.
     """
     # Implementations register themselves when they are imported.
-    from xop_lerobot.low_level import diff_drive, falcon, student  # noqa: F401, PLC0415
+    from xop_lerobot.low_level import amo, diff_drive, falcon, student  # noqa: F401, PLC0415
 
     return POLICIES[name](path=path)

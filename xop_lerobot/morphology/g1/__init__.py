@@ -89,7 +89,7 @@ class G1(Morphology):
             ),
         )
     )
-    policies = ("default", "falcon")
+    policies = ("default", "falcon", "amo")
     frames = {"head": "head", "left_wrist": "left_wrist", "right_wrist": "right_wrist"}
     base_body = "pelvis"
     arms = tuple(
