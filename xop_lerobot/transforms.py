@@ -13,16 +13,13 @@ IDENTITY_POSE.setflags(write=False)
 
 def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Hamilton product a∘b. Shapes (..., 4), wxyz."""
-    aw, ax, ay, az = np.moveaxis(np.asarray(a, float), -1, 0)
-    bw, bx, by, bz = np.moveaxis(np.asarray(b, float), -1, 0)
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
+    aw, ax, ay, az = _split(a)
+    bw, bx, by, bz = _split(b)
+    return _join(
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
     )
 
 
@@ -43,7 +40,29 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cross product over the last axis; np.cross spends four times as long on small arrays."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    return _join(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+
+
+def _split(q: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Components w, x, y, z. Shape (..., 4)."""
+    q = np.asarray(q, float)
+    return q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+
+
+def _join(*components: np.ndarray) -> np.ndarray:
+    """Components as the last axis; np.stack spends three times as long on small arrays."""
+    joined = np.empty((*np.shape(components[0]), len(components)))
+    for i, component in enumerate(components):
+        joined[..., i] = component
+    return joined
+
+
+def sum_squares(vectors: np.ndarray) -> np.ndarray:
+    """Squared length of vectors; a quarter of the time of a sum over so short an axis.
+
+    Shape (..., n) -> (...).
+    """
+    return np.einsum("...i,...i->...", vectors, vectors)
 
 
 def quat_exp(rotvec: np.ndarray) -> np.ndarray:
@@ -68,18 +87,18 @@ def quat_from_yaw(yaw: np.ndarray | float) -> np.ndarray:
     """Rotation about world Z by `yaw` [rad]. Shape (...,) -> (..., 4)."""
     half = np.asarray(yaw, float) / 2
     zero = np.zeros_like(half)
-    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+    return _join(np.cos(half), zero, zero, np.sin(half))
 
 
 def quat_yaw(q: np.ndarray) -> np.ndarray:
     """Heading of the X axis about world Z (Tait-Bryan ZYX) [rad]. Shape (..., 4) -> (...)."""
-    w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
+    w, x, y, z = _split(q)
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def quat_to_rpy(q: np.ndarray) -> np.ndarray:
     """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll). Shape (..., 4) -> (..., 3)."""
-    w, x, y, z = np.moveaxis(np.asarray(q, float), -1, 0)
+    w, x, y, z = _split(q)
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     return np.stack([roll, pitch, quat_yaw(q)], axis=-1)
@@ -182,7 +201,7 @@ def compute_heading_squares(goal: np.ndarray, quat: np.ndarray) -> tuple[np.ndar
 
 def _split_yaw(quat: np.ndarray) -> tuple[np.ndarray, ...]:
     """Heading, and the components w x y z of what is left without it. Shapes (...)."""
-    w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
+    w, x, y, z = _split(quat)
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     c, s = np.cos(yaw / 2), np.sin(yaw / 2)
     return yaw, c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w

@@ -84,6 +84,11 @@ class Placement:
         self._pose_ids = [find_site(model, site) for site in poses]
         self._ids = np.array([find_site(model, site) for site in (*poses, *points)], dtype=int)
         self._com = model.body(com_of).id if com_of else None
+        # Views of what MuJoCo writes: to look an attribute up takes as long as to copy it.
+        data = self._data
+        self._qpos, self._site_xpos = data.qpos, data.site_xpos
+        self._matrices = [data.site_xmat[site] for site in self._pose_ids]
+        self._subtree_com = data.subtree_com[self._com or 0]
 
     def compute(
         self, qpos: np.ndarray
@@ -99,14 +104,14 @@ class Placement:
         quats = np.empty((len(qpos), len(self._pose_ids), 4))
         com = np.empty((len(qpos) if self._com is not None else 0, 3))
         for i, configuration in enumerate(qpos):
-            data.qpos[:] = configuration
+            self._qpos[:] = configuration
             mujoco.mj_kinematics(model, data)
-            positions[i] = data.site_xpos[self._ids]
-            for j, site in enumerate(self._pose_ids):
-                mujoco.mju_mat2Quat(quats[i, j], data.site_xmat[site])
+            self._site_xpos.take(self._ids, axis=0, out=positions[i], mode="clip")
+            for quat, matrix in zip(quats[i], self._matrices, strict=True):
+                mujoco.mju_mat2Quat(quat, matrix)
             if self._com is not None:
                 mujoco.mj_comPos(model, data)
-                com[i] = data.subtree_com[self._com]
+                com[i] = self._subtree_com
         count = len(self._pose_ids)
         poses = np.concatenate([positions[:, :count], quats], axis=2)
         return (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.transforms import sum_squares
 
 
 class ChangeCost(Cost):
@@ -27,4 +28,4 @@ class ChangeCost(Cost):
         if not evaluation.weights.change:
             return np.zeros(len(evaluation.commands))
         change = (evaluation.commands - evaluation.executed) / self.scale
-        return evaluation.weights.change * np.square(change).sum(-1).mean(-1)
+        return evaluation.weights.change * sum_squares(change).mean(-1)

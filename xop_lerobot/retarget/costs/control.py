@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.transforms import sum_squares
 
 
 class ControlCost(Cost):
@@ -25,4 +26,4 @@ class ControlCost(Cost):
     def compute(self, evaluation: Evaluation) -> np.ndarray:
         """Cost of every sample. Shape (K,)."""
         effort = (evaluation.commands - evaluation.reference) / self.scale
-        return evaluation.weights.control * np.square(effort).sum(-1).mean(-1)
+        return evaluation.weights.control * sum_squares(effort).mean(-1)

@@ -6,6 +6,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.transforms import sum_squares
 
 
 class StanceCost(Cost):
@@ -30,16 +31,21 @@ class StanceCost(Cost):
         """Cost of every sample. Shape (K,)."""
         if self.wheeled and evaluation.mode is Mode.MOBILE:
             return np.zeros(len(evaluation.qpos))
-        speeds, heights = [], []
+        speeds = []
         for group in self.groups:
-            velocities = np.stack([evaluation.velocities[site] for site in group])
-            speeds.append(np.square(velocities[:, :, 1:]).sum(-1).mean(0))  # (K, H)
-            points = np.stack([evaluation.points[site] for site in group])
-            heights.append(points[:, :, 1:, 2].mean(0))
-        speed = np.stack(speeds)  # (groups, K, H)
+            velocities = np.array([evaluation.velocities[site] for site in group])
+            speeds.append(sum_squares(velocities[:, :, 1:]).mean(0))  # (K, H)
+        speed = np.array(speeds)  # (groups, K, H)
         if evaluation.mode is Mode.STATIONARY:
             active = speed.sum(axis=0)
         else:
-            lowest = np.stack(heights).argmin(axis=0)[None]
-            active = np.take_along_axis(speed, lowest, axis=0)[0]
+            active = np.take_along_axis(speed, self._find_lowest(evaluation)[None], axis=0)[0]
         return evaluation.weights.stance * active.mean(axis=1)
+
+    def _find_lowest(self, evaluation: Evaluation) -> np.ndarray:
+        """The lowest group of each step. Shape (K, H), int."""
+        heights = []
+        for group in self.groups:
+            points = np.array([evaluation.points[site][:, 1:, 2] for site in group])
+            heights.append(points.mean(0))
+        return np.array(heights).argmin(axis=0)

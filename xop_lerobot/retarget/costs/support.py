@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import quat_yaw
+from xop_lerobot.transforms import quat_yaw, sum_squares
 
 GRAVITY = 9.81
 _VELOCITY_STEPS = 3  # control steps at the end of the horizon that give the velocity
@@ -50,8 +50,9 @@ class SupportArea:
         Shapes (..., 7), (..., 2) -> (..., 2).
         """
         offset = _to_base(base, com) - self._resting
-        length = np.linalg.norm(offset, axis=-1, keepdims=True)
-        return offset * np.maximum(0, 1 - self._free / np.maximum(length, 1e-9))
+        length = np.sqrt(sum_squares(offset))
+        share = np.maximum(0, 1 - self._free / np.maximum(length, 1e-9))
+        return offset * share[..., None]
 
     def linearise_excess(
         self, base: np.ndarray, point: np.ndarray
@@ -83,9 +84,8 @@ def _to_base(base: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points in the base's place and heading. (..., 7), (..., 2) -> (..., 2)."""
     yaw = quat_yaw(base[..., 3:])
     dx, dy = points[..., 0] - base[..., 0], points[..., 1] - base[..., 1]
-    return np.stack(
-        [np.cos(yaw) * dx + np.sin(yaw) * dy, np.cos(yaw) * dy - np.sin(yaw) * dx], axis=-1
-    )
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=-1)
 
 
 class SupportCost(Cost):
@@ -126,11 +126,11 @@ class SupportCost(Cost):
             span = (velocity.shape[1] - 1) * dt
             acceleration = (velocity[:, -1] - velocity[:, 0]) / span
         zmp = com[..., :2] - com[..., 2:] / GRAVITY * acceleration[:, None]
-        excess = np.square(self.area.compute_excess(evaluation.qpos[:, 1:, :7], zmp)).sum(-1)
-        excess = excess.mean(-1) + np.square(self._compute_capture_excess(evaluation)).sum(-1)
+        excess = sum_squares(self.area.compute_excess(evaluation.qpos[:, 1:, :7], zmp))
+        excess = excess.mean(-1) + sum_squares(self._compute_capture_excess(evaluation))
         base, com = evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
-        excess += np.square(self.area.compute_excess(base, com)).sum(-1)
-        lean = np.square(self.area.compute_lean(base, com)).sum(-1)
+        excess += sum_squares(self.area.compute_excess(base, com))
+        lean = sum_squares(self.area.compute_lean(base, com))
         return evaluation.weights.support * excess + evaluation.weights.lean * lean
 
     def _compute_capture_excess(self, evaluation: Evaluation) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import compute_heading_squares
+from xop_lerobot.transforms import compute_heading_squares, sum_squares
 
 
 class TrackingCost(Cost):
@@ -35,6 +35,6 @@ def compute_tracking(poses: np.ndarray, goals: np.ndarray, weights: CostWeights)
     with the errors of heading and tilt of `heading_error`, and κ the share of a tilt: at κ = 1
     and for small errors, the paper's :math:`d(\theta, \theta^d)^2`.
     """
-    position = np.square(poses[..., :3] - goals[..., :3]).sum(-1)
+    position = sum_squares(poses[..., :3] - goals[..., :3])
     turn, tilt = compute_heading_squares(goals[..., 3:], poses[..., 3:])
     return weights.position * position + weights.orientation * (turn + weights.tilt_share * tilt)

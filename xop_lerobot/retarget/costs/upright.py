@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply, quat_rotate
+from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply, quat_rotate, sum_squares
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -40,7 +40,7 @@ def compute_side(pose: np.ndarray) -> np.ndarray:
 
 def compute_upright(poses: np.ndarray, side: np.ndarray | float = 1.0) -> np.ndarray:
     r""":math:`\|R e_z - s e_z\|^2` of poses. Shape (..., 7) -> (...)."""
-    return np.square(compute_upright_error(poses, side)).sum(-1)
+    return sum_squares(compute_upright_error(poses, side))
 
 
 def compute_upright_error(poses: np.ndarray, side: np.ndarray | float = 1.0) -> np.ndarray:
