@@ -10,7 +10,9 @@ _GROUPS = (slice(0, 3), slice(3, 5), slice(5, 6), slice(6, None))
 
 _LEARNING = 0.05  # share of the newest sample in a sensor's observed noise
 _NOISE_RANGE = (0.1, 10.0)  # observed noise over the configured one
+_LEAST_NOISE, _MOST_NOISE = np.square(_NOISE_RANGE)
 _TRENDS = np.array([[0.3], [0.1]])  # share of the newest sample in the mean disagreements
+_TREND_STD = np.sqrt(_TRENDS / (2 - _TRENDS))  # standard deviation of such a mean of noise
 
 
 class SensorFilter:
@@ -123,13 +125,12 @@ class SensorFilter:
 
     def _observe_noise(self, error: np.ndarray, carried: np.ndarray, fresh: np.ndarray) -> None:
         """Follow the white noise of each sensor by what differs from one sample to the next."""
-        low, high = np.square(_NOISE_RANGE)
         difference = 0.5 * (np.square(error - self._innovation) - carried) / self._configured
         seen = np.add.reduceat(difference, self._starts) / self._sizes
         useful = np.logical_and.reduceat(fresh, self._starts)
         rate = np.where(useful, _LEARNING, 0.0)
-        self._level += rate * (np.clip(seen, 0.0, high) - self._level)
-        self._level = np.maximum(self._level, low)
+        self._level += rate * (np.clip(seen, 0.0, _MOST_NOISE) - self._level)
+        self._level = np.maximum(self._level, _LEAST_NOISE)
         self._noise = self._configured * np.repeat(self._level, self._sizes)
         self._innovation = np.where(fresh, error, self._innovation)
 
@@ -137,10 +138,11 @@ class SensorFilter:
         """Entries that disagree once by too much, or by less for several ticks. Shape (nv,)."""
         ratio = error / np.sqrt(variance + self._noise)
         self._trend += np.where(fresh, _TRENDS * (ratio - self._trend), 0.0)
-        of_noise = np.sqrt(_TRENDS / (2 - _TRENDS))  # standard deviation of such a mean of noise
         lost = np.abs(ratio) > self._gate
-        lost |= (np.abs(self._trend) > self._gate * of_noise).any(axis=0)
+        lost |= (np.abs(self._trend) > self._gate * _TREND_STD).any(axis=0)
         lost &= fresh
+        if not lost.any():
+            return lost
         for group in _GROUPS[:3]:
             lost[group] = lost[group].any() & fresh[group]
         self._trend[:, lost] = 0

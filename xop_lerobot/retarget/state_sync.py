@@ -22,6 +22,7 @@ from xop_lerobot.retarget.velocity_projection import (
     ContactVelocity,
     compute_disagreement,
     project_velocity,
+    solve_positive,
 )
 from xop_lerobot.state import freeze
 
@@ -292,7 +293,7 @@ class StateSync:
         jacobian, error, _ = self.task.compute_qp_residual(self._configuration)
         hessian = jacobian.T @ jacobian
         hessian.flat[:: len(hessian) + 1] += _DAMPING
-        step = np.linalg.solve(hessian, error @ jacobian)
+        step = solve_positive(hessian, error @ jacobian)
         reached = self._configuration.data.qpos[self._limited_qpos] + step[self._limited_dofs]
         low, high = self._range[:, 0] - _BOUND_SLACK, self._range[:, 1] + _BOUND_SLACK
         if not ((reached < low) | (reached > high)).any():

@@ -59,7 +59,7 @@ class SyncConfig:
         max_gap_s: Time without a measurement after which memory is worthless [s].
         iterations: Most steps of the SQP.
         tolerance: Largest entry of a step that is the last one [m, rad]; the SQP converges
-            quadratically, so what is left after it is under 1e-6.
+            quadratically, so what is left after it is about its square, 0.02 mm.
         recursive: Whether anything is remembered from tick to tick; without, each solve sees
             its own measurement alone (Eq. 4 as the paper has it, but for the stance location).
         project_velocity: Whether the velocity is projected on the stance constraint.
@@ -93,7 +93,7 @@ class SyncConfig:
     gate: float = 4.0
     max_gap_s: float = 0.3
     iterations: int = 4
-    tolerance: float = 2e-4
+    tolerance: float = 5e-3
     recursive: bool = True
     project_velocity: bool = True
     equilibrium: bool = True
