@@ -119,13 +119,18 @@ class Teleoperation:
         self.device.disconnect()
         self._follower.close()
 
-    def reset(self, obstacles: tuple[Obstacle, ...] | None = None) -> None:
+    def reset(
+        self, obstacles: tuple[Obstacle, ...] | None = None, episode: int | None = None
+    ) -> None:
         """Start over, as after a reset of the robot: nobody is engaged, no plan is known.
 
         Args:
             obstacles: What stands around the robot now; None where that has not changed.
+            episode: Which episode of a session begins; None where there are none.
         """
         self.set_obstacles(obstacles)
+        if episode is not None:
+            self.device.begin_episode(episode)
         self._start_over()
 
     def set_obstacles(self, obstacles: tuple[Obstacle, ...] | None) -> None:

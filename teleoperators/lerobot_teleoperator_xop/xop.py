@@ -176,7 +176,7 @@ class Xop(Teleoperator):
         teleoperation = Teleoperation(config, info)
         teleoperation.connect()
         self._resets_seen = self._session.reset_count
-        teleoperation.set_obstacles(self._session.obstacles)
+        teleoperation.reset(self._session.obstacles, self._session.episode)
         return teleoperation
 
     def get_action(self) -> dict[str, float]:
@@ -198,7 +198,7 @@ class Xop(Teleoperator):
             self._teleoperation = self._make_teleoperation(info)
         if self._session.reset_count != self._resets_seen:
             self._resets_seen = self._session.reset_count
-            self._teleoperation.reset(self._session.obstacles)
+            self._teleoperation.reset(self._session.obstacles, self._session.episode)
         self._teleoperation.see(self._session.view)
         action, self._session.tick = self._teleoperation.step(state)
         return info.morphology.layout.to_dict(action)

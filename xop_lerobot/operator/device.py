@@ -27,6 +27,10 @@ class Device(ABC):
     def disconnect(self) -> None:
         """Close the device; may be called twice."""
 
+    def begin_episode(self, index: int) -> None:
+        """Be told that episode `index` of a session begins, so that it is the same every time."""
+        del index
+
     def start(self, time: float) -> None:
         """Start the device's own clock at `time` [s] of the robot's clock (at engage)."""
 

@@ -40,6 +40,11 @@ class SimulatedDevice(Device):
         self._started_at: float | None = None
         self._over_at: float | None = None
 
+    def begin_episode(self, index: int) -> None:
+        """Be the person of episode `index`, however many there were before."""
+        self._attempt = index
+        self._begin()
+
     def start(self, time: float) -> None:
         """Begin with the task, at `time` [s] of the robot's clock; after a reset, once more."""
         if self._started_at is not None:
