@@ -3,10 +3,10 @@
 import csv
 import json
 import os
-import signal
 import time
 
 import pytest
+from eval_jobs import do, make_trial, run_made
 
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.evaluation import study
@@ -47,36 +47,6 @@ def offline(monkeypatch):
     study._find_absence.cache_clear()
     yield
     study._find_absence.cache_clear()
-
-
-def do(job):
-    """What the workers of these tests do."""
-    if job == "fail":
-        raise ValueError("bad luck")
-    if job == "die":
-        os.kill(os.getpid(), signal.SIGKILL)
-    if job == "threads":
-        return [os.environ[name] for name in THREAD_VARIABLES]
-    return job * 2, os.getpid()
-
-
-def make_trial(setup, seed, **changed):
-    metrics = {"abp": 0.1 * (seed + 1), "tilt": None, "jerk": 10.0, "plan_ms": 5.0}
-    record = {
-        "key": compute_key(setup, seed), "seed": seed, "success": True, "picked_up": False,
-        "collision": False, "collisions": [], "fallen": False, "failure": "",
-        "completion_s": 10.0 + seed, "sim_s": 12.0, "wall_s": 6.0, "metrics": metrics,
-        "code": "0", "plot": {"dt": 0.2, "head_xy": [[0, 0], [1, 0.5]], "head_error": [0.1, None],
-                              "left_error": [None, 0.1], "right_error": [0.1, 0.1]},
-    }  # fmt: skip
-    return {**record, **{"robot": setup.robot, "task": setup.task}, **changed}
-
-
-def run_made(job):
-    """Run a trial in no time; seed 1 dies."""
-    if job.seed == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return make_trial(job.setup, job.seed)
 
 
 def test_a_worker_that_dies_or_fails_costs_its_own_job_alone():
