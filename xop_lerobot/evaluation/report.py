@@ -1,0 +1,279 @@
+"""The page of a study: tables beside the paper's, plots with intervals, a film of each cell.
+
+One HTML file that needs no other: pictures and films are inside it. The films lie beside it too.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from xop_lerobot.errors import XopError
+from xop_lerobot.evaluation.bench_report import describe_machine
+from xop_lerobot.evaluation.intervals import Interval, compute_mean_interval, compute_rate_interval
+from xop_lerobot.evaluation.methods import get_method
+from xop_lerobot.evaluation.published import PUBLISHED_TRIALS, PublishedRow, find_published
+from xop_lerobot.evaluation.report_films import load_film, write_film
+from xop_lerobot.evaluation.report_plots import (
+    find_values,
+    plot_errors,
+    plot_means,
+    plot_rates,
+    plot_ways,
+)
+from xop_lerobot.evaluation.study import Cell, Results, compute_key
+from xop_lerobot.plant.gl import RenderingUnavailable
+
+logger = logging.getLogger(__name__)
+
+PAGE = "index.html"
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem; color: #222;
+       padding: 0 1rem; }
+table { border-collapse: collapse; margin: 0.7rem 0; display: block; overflow-x: auto; }
+th, td { padding: 0.25rem 0.6rem; border-bottom: 1px solid #ddd; text-align: left;
+         white-space: nowrap; }
+th { border-bottom: 2px solid #888; }
+td small { color: #777; }
+tr.theirs td { color: #7a5c1e; background: #fdf8ec; }
+tr.theirs:first-of-type td { border-top: 2px solid #c9a24a; }
+tr.absent td { color: #999; }
+img { max-width: 100%; }
+figure { display: inline-block; margin: 0.4rem; vertical-align: top; }
+figcaption { font-size: 13px; max-width: 320px; }
+.note { color: #555; font-size: 14px; }
+"""
+_EXPLANATION = """
+<p class="note">Ours: a simulated person in the headset, the same one with the same seed for every
+method; sensors with noise; success decided by the physics. Counts are out of all trials, with
+Wilson's 95% interval; means have their standard deviation and, small, the 95% interval of the mean
+by a bootstrap. CT is over successful trials. ABP: mean over the ticks in standing mode and over
+legs and waist of |torque × velocity|; in brackets with its sign. Tilt and jerk: of the carrying
+palm until 10 cm from the opening. Every figure is defined in docs/evaluation.md.</p>
+<p class="note"><b>Rows in brown are the paper's own (10 trials, human operators, a real headset;
+Tables II to IV).</b> Its rooms, points and people are not ours: compare methods within a table,
+not rows across.</p>
+"""
+
+
+def write_report(
+    folder: Path,
+    cells: Sequence[Cell],
+    found: Sequence[Sequence[Mapping[str, Any]]],
+    rows: Sequence[Mapping[str, Any]],
+    results: Results,
+    videos: int = 1,
+) -> Path:
+    """Write the page of a study and return its path.
+
+    Args:
+        folder: Folder to write to.
+        cells: The study.
+        found: Trials of each cell.
+        rows: The table's row of each cell.
+        results: Where the films' positions are.
+        videos: Films of each cell; the first seeds, and failures before successes after the first.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    parts = [_make_head(cells, found)]
+    groups: dict[tuple[str, str], list[int]] = {}
+    for index, cell in enumerate(cells):
+        groups.setdefault((cell.setup.robot, cell.setup.task), []).append(index)
+    for (robot, task), members in groups.items():
+        chosen = [cells[i] for i in members]
+        trials = [found[i] for i in members]
+        parts.append(f"<h2>{_escape(f'{robot}: {task}')}</h2>")
+        parts.append(_make_table(chosen, trials, [rows[i] for i in members], robot, task))
+        parts += _make_plots(folder, f"{robot}-{task}", chosen, trials)
+        parts += _make_films(folder, chosen, trials, results, videos)
+    page = folder / PAGE
+    body = "\n".join(parts)
+    page.write_text(
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f"<title>Simulation study</title><style>{_STYLE}</style></head>"
+        f"<body>\n{body}\n</body></html>\n",
+        encoding="utf-8",
+    )
+    table = json.dumps(list(rows), indent=1, allow_nan=False)
+    (folder / "table.json").write_text(table + "\n", encoding="utf-8")
+    return page
+
+
+def _make_head(cells: Sequence[Cell], found: Sequence[Sequence[Mapping[str, Any]]]) -> str:
+    count = sum(map(len, found))
+    wanted = sum(cell.trials for cell in cells if not cell.absence)
+    sim = sum(trial["sim_s"] for trials in found for trial in trials)
+    wall = sum(trial["wall_s"] for trials in found for trial in trials)
+    codes = sorted({trial["code"] for trials in found for trial in trials})
+    machine = ", ".join(f"{name} {value}" for name, value in describe_machine().items())
+    pace = f", {sim / wall:.2f} of real time in each process" if wall else ""
+    return (
+        "<h1>Simulation study</h1>"
+        f"<p>{count} of {wanted} trials; {sim / 60:.0f} min simulated{pace}. "
+        f"{_escape(machine)}. State of the code: {_escape(', '.join(codes) or 'none')}.</p>"
+        + _EXPLANATION
+    )
+
+
+def label_cell(cell: Cell, cells: Iterable[Cell]) -> str:
+    """Method and variant, with the low-level policy where the cells have several."""
+    setup = cell.setup
+    label = f"{setup.method} {setup.variant}".strip()
+    several = len({each.setup.low_level for each in cells}) > 1
+    return f"{label} ({setup.low_level})" if several else label
+
+
+_COLUMNS = ("method", "success", "pickup", "collision", "falls", "CT [s]", "ABP [W]",
+            "tilt [rad]", "jerk [m/s³]", "head, hands error [cm]", "solve p99 [ms]")  # fmt: skip
+
+
+def _make_table(
+    cells: Sequence[Cell],
+    found: Sequence[Sequence[Mapping[str, Any]]],
+    rows: Sequence[Mapping[str, Any]],
+    robot: str,
+    task: str,
+) -> str:
+    lines = ["<table><thead><tr>"]
+    lines += [f"<th>{_escape(name)}</th>" for name in _COLUMNS]
+    lines.append("</tr></thead><tbody>")
+    for cell, trials, row in zip(cells, found, rows, strict=True):
+        lines.append(_make_row(cell, cells, trials, row))
+    lines += [_make_published_row(each) for each in find_published(robot, task)]
+    lines.append("</tbody></table>")
+    return "".join(lines)
+
+
+def _make_row(
+    cell: Cell,
+    cells: Sequence[Cell],
+    trials: Sequence[Mapping[str, Any]],
+    row: Mapping[str, Any],
+) -> str:
+    title = f"<b>{_escape(label_cell(cell, cells))}</b><br><small>"
+    title += f"{_escape(get_method(cell.setup.method).title)}</small>"
+    if not trials:
+        note = _escape(row["note"] or "not run yet")
+        return (
+            f'<tr class="absent"><td>{title}</td><td colspan="{len(_COLUMNS) - 1}">{note}</td></tr>'
+        )
+    fields = [title]
+    fields += [
+        _format_count(row[n], len(trials)) for n in ("success", "pickup", "collision", "falls")
+    ]
+    for name, prefix, digits in (
+        ("completion_s", "ct", 1), ("abp", "abp", 2), ("tilt", "tilt", 3), ("jerk", "jerk", 0)
+    ):  # fmt: skip
+        values = find_values(trials, name)
+        field = _format_mean(row[f"{prefix}_mean"], row[f"{prefix}_std"], values, digits)
+        if name == "abp" and row["abp_signed_mean"] is not None:
+            field += f"<br><small>({row['abp_signed_mean']:+.2f} signed)</small>"
+        fields.append(field)
+    errors = (row["head_error_mean"], row["hands_error_mean"])
+    fields.append(", ".join("–" if e is None else f"{e * 100:.1f}" for e in errors))
+    p99 = row["plan_p99_ms_mean"]
+    fields.append("–" if p99 is None else f"{p99:.0f}")
+    return "<tr>" + "".join(f"<td>{field}</td>" for field in fields) + "</tr>"
+
+
+def _make_published_row(row: PublishedRow) -> str:
+    label = f"{row.method} {row.variant}".strip()
+    title = (
+        f"{_escape(label)} ({_escape(row.low_level)})<br><small>the paper, {row.setting}</small>"
+    )
+    fields = [title]
+    for count in (row.success, row.pickup, row.collision):
+        fields.append("–" if count is None else f"{count}/{PUBLISHED_TRIALS}")
+    fields.append("–")
+    for spread, digits in ((row.ct, 1), (row.abp, 2), (row.tilt, 2), (row.jerk, 0)):
+        fields.append("–" if spread is None else f"{spread[0]:.{digits}f} ± {spread[1]:.{digits}f}")
+    fields += ["–", "–"]
+    return '<tr class="theirs">' + "".join(f"<td>{field}</td>" for field in fields) + "</tr>"
+
+
+def _format_count(count: int, trials: int) -> str:
+    low, high = compute_rate_interval(count, trials)
+    return f"{count}/{trials}<br><small>{low:.0%} to {high:.0%}</small>"
+
+
+def _format_mean(
+    mean: float | None, std: float | None, values: Sequence[float], digits: int
+) -> str:
+    if mean is None or std is None:
+        return "–"
+    interval: Interval = compute_mean_interval(values)
+    return (
+        f"{mean:.{digits}f} ± {std:.{digits}f}<br>"
+        f"<small>{interval.low:.{digits}f} to {interval.high:.{digits}f}</small>"
+    )
+
+
+def _make_plots(
+    folder: Path, name: str, cells: Sequence[Cell], found: Sequence[Sequence[Mapping[str, Any]]]
+) -> list[str]:
+    groups = {
+        label_cell(cell, cells): (cell.setup.method, trials)
+        for cell, trials in zip(cells, found, strict=True)
+        if trials
+    }
+    if not groups:
+        return []
+    parts = []
+    for kind, title, picture in (
+        ("rates", "Rates, with 95% intervals", plot_rates(groups)),
+        ("means", "Every trial, mean and its 95% interval", plot_means(groups)),
+        ("ways", "Way of the head from above; a cross ends a failure", plot_ways(groups)),
+        ("errors", "Errors over time, first trial of each", plot_errors(groups)),
+    ):
+        if picture is not None:
+            (folder / f"{name}-{kind}.png").write_bytes(picture)
+            parts.append(f"<h3>{title}</h3>")
+            parts.append(f'<img alt="{title}" src="data:image/png;base64,{_encode(picture)}">')
+    return parts
+
+
+def choose_trials(trials: Sequence[Mapping[str, Any]], number: int) -> list[Mapping[str, Any]]:
+    """The first trial, then failures, then the others, in the order of their seeds."""
+    rest = sorted(trials[1:], key=lambda trial: (trial["success"], trial["seed"]))
+    return [*trials[:1], *rest][:number]
+
+
+def _make_films(
+    folder: Path,
+    cells: Sequence[Cell],
+    found: Sequence[Sequence[Mapping[str, Any]]],
+    results: Results,
+    number: int,
+) -> list[str]:
+    parts = []
+    for cell, trials in zip(cells, found, strict=True):
+        for record in choose_trials(trials, number):
+            key = compute_key(cell.setup, record["seed"])
+            path = folder / f"{key}.mp4"
+            try:
+                write_film(path, record, cell.setup, load_film(results.film_path(key)))
+            except RenderingUnavailable as error:
+                return [f'<p class="note">No films: {_escape(str(error))}</p>']
+            except XopError as error:
+                logger.warning("no film of %s: %s", key, error)
+                continue
+            end = "success" if record["success"] else record["failure"] or "time is up"
+            text = _escape(f"{label_cell(cell, cells)}, seed {record['seed']}: {end}")
+            parts.append(
+                f'<figure><video controls muted loop width="320" src="data:video/mp4;base64,'
+                f'{_encode(path.read_bytes())}"></video><figcaption>{text}</figcaption></figure>'
+            )
+    return ["<h3>Films</h3>", *parts] if parts else []
+
+
+def _encode(content: bytes) -> str:
+    return base64.b64encode(content).decode()
+
+
+def _escape(text: str) -> str:
+    return html.escape(text)
