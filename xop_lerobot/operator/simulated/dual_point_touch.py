@@ -11,6 +11,7 @@ from xop_lerobot.operator.simulated.hands import (
     compute_errors,
     compute_pointing,
     compute_wrist,
+    lean,
     look_at_work,
     nudge,
     plan_posture,
@@ -23,15 +24,18 @@ from xop_lerobot.operator.simulated.walking import compute_miss, find, go_to, se
 POINTS = ("left_point", "right_point")
 APPROACHES = 6
 """How often a person walks up anew before giving up."""
-CLOSER = 0.04
-"""How much closer a person stands at the next approach [m]."""
+LARGEST_SHIFT = 0.10
+"""How much closer, or farther, a person stands at the next approach at most [m]."""
+LEAN_AFTER = 2
+"""Number of corrections in vain after which the person leans."""
 
 
 def touch_two_points(mind: Mind) -> Doing:
     """Bring both palms to their points and hold them there until it counts."""
     yield from find(mind, *POINTS)
-    for approach in range(APPROACHES):
-        place = plan_place(mind, approach * CLOSER)
+    closer = 0.0
+    for _ in range(APPROACHES):
+        place = plan_place(mind, closer)
         miss, turn = compute_miss(mind, place)
         if miss > 2 * mind.person.place_tolerance or abs(turn) > mind.person.heading_tolerance:
             yield from set_mode(mind, Mode.MOBILE)
@@ -40,6 +44,9 @@ def touch_two_points(mind: Mind) -> Doing:
         yield from hold_points(mind)
         if mind.eyes.success:
             return
+        missed = np.mean(list(compute_errors(mind, get_points(mind)).values()), axis=0)
+        ahead = np.array([np.cos(place[2]), np.sin(place[2])])
+        closer += float(np.clip(missed[:2] @ ahead, -LARGEST_SHIFT, LARGEST_SHIFT))
 
 
 def get_points(mind: Mind) -> dict[str, np.ndarray]:
@@ -104,6 +111,9 @@ def hold_points(mind: Mind) -> Doing:
         worst_ever = min(worst, worst_ever)
         if wasted >= mind.person.corrections:
             return
+        if wasted == LEAN_AFTER:
+            yield from lean(mind, errors)
+            continue
         far = {
             side: error
             for side, error in errors.items()

@@ -24,6 +24,8 @@ MARGIN = 0.15
 """How far within the field of view a person wants to have what the hands work on [rad]."""
 LARGEST_NOD = 0.5
 """Largest nod [rad]."""
+LARGEST_LEAN = 0.12
+"""How far a person leans without a step [m]."""
 SHOULDER = (-0.08, 0.18, -0.28)
 """Left shoulder from the eyes, forward, left, up [m], for eyes at 1.6 m."""
 ARM = (0.30, 0.26)
@@ -87,6 +89,22 @@ def look_at_work(mind: Mind, points: Mapping[str, np.ndarray]) -> Doing:
     posture = replace(last, look=np.array([0.0, nod]))
     keep = dict(zip(SIDES, room, strict=True))
     yield from take_posture(mind, body.with_hands_in_room(posture, keep))
+
+
+def lean(mind: Mind, errors: Mapping[str, np.ndarray]) -> Doing:
+    """Lean to where the hands do not get; they stay where they are in the room.
+
+    Args:
+        mind: Who leans.
+        errors: What the palms miss their points by, robot's world [m]. Shapes (3,).
+    """
+    body, last = mind.body, mind.body.posture
+    missed = np.mean(list(errors.values()), axis=0)
+    way = quat_rotate(quat_from_yaw(-mind.belief.turn - float(last.place[2])), missed)[:2]
+    way = np.clip(last.lean + way, -LARGEST_LEAN, LARGEST_LEAN)
+    mind.note(f"lean to {100 * way[0]:.0f} cm ahead, {100 * way[1]:.0f} cm left")
+    keep = dict(zip(SIDES, body.compute_hands_in_room(), strict=True))
+    yield from take_posture(mind, body.with_hands_in_room(replace(last, lean=way), keep))
 
 
 def compute_wrist(mind: Mind, side: str, palm: np.ndarray, quat: np.ndarray) -> np.ndarray:

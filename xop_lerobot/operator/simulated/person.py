@@ -51,7 +51,7 @@ class Person:
 
     eye_height: float = 1.60
     leg_bend: float = 0.45
-    reach: float = 0.48
+    reach: float = 0.40
     reach_low: float = 0.55
     reach_high: float = 0.12
     display_delay: float = 0.135
