@@ -97,7 +97,7 @@ class Body:
     def __init__(self, person: Person, noise: HumanNoise) -> None:
         self._person, self._noise = person, noise
         self.posture = Posture(
-            np.zeros(3), 0.0, np.zeros(2), np.zeros(2), relaxed_hands(person.eye_height / 1.6)
+            np.zeros(3), 0.0, np.zeros(2), np.zeros(2), relaxed_hands(person.size)
         )
         self._start = self._end = self.posture
         self._began, self._duration, self._ramp = 0.0, 0.0, 0.0

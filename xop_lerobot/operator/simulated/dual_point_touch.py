@@ -8,9 +8,11 @@ from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.body import SIDES
 from xop_lerobot.operator.simulated.hands import (
+    compute_distance,
     compute_errors,
     compute_pointing,
     compute_wrist,
+    is_stretched,
     lean,
     look_at_work,
     nudge,
@@ -24,8 +26,8 @@ from xop_lerobot.operator.simulated.walking import compute_miss, find, go_to, se
 POINTS = ("left_point", "right_point")
 APPROACHES = 6
 """How often a person walks up anew before giving up."""
-LARGEST_SHIFT = 0.10
-"""How much closer, or farther, a person stands at the next approach at most [m]."""
+SHIFT = 0.07
+"""How much closer a person stands at the next approach, or farther, if arms were bent [m]."""
 LEAN_AFTER = 2
 """Number of corrections in vain after which the person leans."""
 
@@ -44,9 +46,9 @@ def touch_two_points(mind: Mind) -> Doing:
         yield from hold_points(mind)
         if mind.eyes.success:
             return
-        missed = np.mean(list(compute_errors(mind, get_points(mind)).values()), axis=0)
-        ahead = np.array([np.cos(place[2]), np.sin(place[2])])
-        closer += float(np.clip(missed[:2] @ ahead, -LARGEST_SHIFT, LARGEST_SHIFT))
+        points = get_points(mind)
+        stretched = any(is_stretched(mind, side, point) for side, point in points.items())
+        closer += SHIFT if stretched else -SHIFT
 
 
 def get_points(mind: Mind) -> dict[str, np.ndarray]:
@@ -74,8 +76,7 @@ def plan_place(mind: Mind, closer: float = 0.0) -> np.ndarray:
         heading = float(np.arctan2(*(middle[:2] - head[:2])[::-1]))
     else:
         heading = compute_heading(head[3:])
-    person = mind.person
-    ahead = person.reach * person.eye_height / 1.6 * mind.belief.scale - closer
+    ahead = compute_distance(mind, list(points.values())) - closer
     return np.array(
         [
             middle[0] - ahead * np.cos(heading),
@@ -103,7 +104,8 @@ def hold_points(mind: Mind) -> Doing:
         yield from look_at_work(mind, points)
         errors = compute_errors(mind, points)
         worst = max(float(np.linalg.norm(error)) for error in errors.values())
-        mind.note(f"palms {100 * worst:.1f} cm off")
+        unseen = [side for side in SIDES if not mind.eyes.sees(f"{side}_palm")]
+        mind.note(f"palms {100 * worst:.1f} cm off" + f", {unseen} not seen" * bool(unseen))
         if worst <= mind.person.hand_tolerance:
             yield from mind.pause(0.4)
             continue

@@ -24,6 +24,10 @@ MARGIN = 0.15
 """How far within the field of view a person wants to have what the hands work on [rad]."""
 LARGEST_NOD = 0.5
 """Largest nod [rad]."""
+KNEES = 0.3
+"""How much farther out hands work for each metre of squatting [m/m]."""
+STRETCHED = 0.8
+"""Share of the arm's length from which it counts as stretched."""
 LARGEST_LEAN = 0.12
 """How far a person leans without a step [m]."""
 SHOULDER = (-0.08, 0.18, -0.28)
@@ -49,15 +53,40 @@ def plan_posture(mind: Mind, points: list[np.ndarray]) -> Posture:
     person squats, and nods to see it.
     """
     person, belief, body = mind.person, mind.belief, mind.body
-    middle = np.mean(points, axis=0)
     standing = person.eye_height
-    below = standing - belief.height_to_own(float(middle[2]))
-    drop = float(np.clip(below - person.reach_low * standing / 1.6, 0.0, person.leg_bend))
+    drop = compute_drop(mind, points)
     lowest = standing - drop - belief.height_to_own(float(min(p[2] for p in points)))
-    nod = np.arctan2(lowest, person.reach * standing / 1.6)
+    nod = np.arctan2(lowest, person.reach * person.size)
     nod -= person.view_half_angles[1] - MARGIN
     look = np.array([0.0, float(np.clip(nod, 0.0, LARGEST_NOD))])
     return replace(body.posture, drop=drop, lean=np.zeros(2), look=look)
+
+
+def compute_drop(mind: Mind, points: list[np.ndarray]) -> float:
+    """How far a person squats for points of the robot's world [m, own]."""
+    person, middle = mind.person, np.mean(points, axis=0)
+    below = person.eye_height - mind.belief.height_to_own(float(middle[2]))
+    return float(np.clip(below - person.reach_low * person.size, 0.0, person.leg_bend))
+
+
+def compute_distance(mind: Mind, points: list[np.ndarray]) -> float:
+    """How far ahead of the head points are worked at best, in the robot's world [m].
+
+    Who squats has the knees ahead, and works farther out.
+    """
+    person = mind.person
+    own = person.reach * person.size + KNEES * compute_drop(mind, points)
+    return mind.belief.scale * own
+
+
+def is_stretched(mind: Mind, side: str, point: np.ndarray) -> bool:
+    """Whether the arm has to be stretched, or nearly so, to bring the palm to a point."""
+    frame = mind.body.posture.compute_frame(mind.person.eye_height)
+    target = mind.belief.point_to_own(point, mind.body.compute_head())
+    left = 1.0 if side == "left" else -1.0
+    shoulder = _apply(frame, mind.person.size * np.array(SHOULDER) * [1, left, 1])
+    reach = float(np.linalg.norm(target - shoulder))
+    return reach > STRETCHED * mind.person.size * (sum(ARM) + HAND)
 
 
 def take_posture(mind: Mind, posture: Posture) -> Doing:
@@ -126,7 +155,7 @@ def compute_pointing(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
     The forearm follows from the own arm: two links from shoulder to wrist, elbow down and a
     little out.
     """
-    left, size = (1.0 if side == "left" else -1.0), mind.person.eye_height / 1.6
+    left, size = (1.0 if side == "left" else -1.0), mind.person.size
     body, belief = mind.body, mind.belief
     frame = body.posture.compute_frame(mind.person.eye_height)
     back = pose_inverse(frame)

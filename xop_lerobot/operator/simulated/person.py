@@ -14,7 +14,8 @@ class Person:
     Attributes:
         eye_height: Height of the eyes over the floor, standing [m].
         leg_bend: How far the eyes can be lowered by squatting [m].
-        reach: Distance ahead of the eyes at which the hands work comfortably [m].
+        reach: Distance ahead of the eyes at which the hands of a person with eyes at 1.6 m work
+            comfortably [m].
         reach_low: How far below the eyes they still do [m].
         reach_high: How far below the eyes they do at least [m].
         display_delay: From an event at the robot to its picture in the headset [s].
@@ -51,8 +52,8 @@ class Person:
 
     eye_height: float = 1.60
     leg_bend: float = 0.45
-    reach: float = 0.40
-    reach_low: float = 0.55
+    reach: float = 0.42
+    reach_low: float = 0.50
     reach_high: float = 0.12
     display_delay: float = 0.135
     visual_delay: float = 0.11
@@ -84,6 +85,11 @@ class Person:
     hand_tolerance: float = 0.028
     corrections: int = 6
     time_limit: float = 150.0
+
+    @property
+    def size(self) -> float:
+        """Height over that of the person whose lengths are given here."""
+        return self.eye_height / Person.eye_height
 
     @property
     def delay(self) -> float:

@@ -79,7 +79,7 @@ def go_to(
     """
     person = mind.person
     near = person.place_tolerance if tolerance is None else tolerance
-    hands = relaxed_hands(person.eye_height / 1.6) if hands is None else hands
+    hands = relaxed_hands(person.size) if hands is None else hands
     yield from mind.settle()
     for leg in range(tries):
         miss, turn = compute_miss(mind, place)
