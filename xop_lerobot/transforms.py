@@ -178,33 +178,28 @@ def heading_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def compute_heading_squares(goal: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Squares of `heading_error`: of the heading's, and of roll's and pitch's together [rad²].
+    r"""Squares of `heading_error`: of the heading's, and of roll's and pitch's together [rad²].
 
-    Component by component, in a third of the time of the vector itself.
+    Without the vector itself, in a quarter of its time. The tilts' error is
+    :math:`R_z(-\psi_{goal})\,d\,R_z(\psi)` with :math:`d = q_{goal} q^{-1}`: turns about Z leave
+    :math:`d_x^2 + d_y^2` alone, and turn :math:`d_w + i d_z` by half the error of the heading.
 
     Shapes (..., 4) and (..., 4) -> (...), (...).
     """
-    yaw_goal, gw, gx, gy, gz = _split_yaw(goal)
-    yaw, w, x, y, z = _split_yaw(quat)
-    turn = (yaw_goal - yaw + np.pi) % (2 * np.pi) - np.pi
-    # The error of the tilts, T_goal T^-1.
-    ew = gw * w + gx * x + gy * y + gz * z
-    ex = gx * w - gw * x + gz * y - gy * z
-    ey = gy * w - gw * y + gx * z - gz * x
-    ez = gz * w - gw * z + gy * x - gx * y
-    level = ex * ex + ey * ey
+    gw, gx, gy, gz = _split(goal)
+    w, x, y, z = _split(quat)
+    turn = (quat_yaw(goal) - quat_yaw(quat) + np.pi) % (2 * np.pi) - np.pi
+    dw = gw * w + gx * x + gy * y + gz * z
+    dx = gx * w - gw * x + gz * y - gy * z
+    dy = gy * w - gw * y + gx * z - gz * x
+    dz = gz * w - gw * z + gy * x - gx * y
+    level = dx * dx + dy * dy
+    c, s = np.cos(turn / 2), np.sin(turn / 2)
+    ew, ez = c * dw + s * dz, c * dz - s * dw
     sine = np.sqrt(level + ez * ez)
     angle = 2 * np.arctan2(sine, np.abs(ew))
     scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0)
     return turn * turn, scale * scale * level
-
-
-def _split_yaw(quat: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Heading, and the components w x y z of what is left without it. Shapes (...)."""
-    w, x, y, z = _split(quat)
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    c, s = np.cos(yaw / 2), np.sin(yaw / 2)
-    return yaw, c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w
 
 
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray:

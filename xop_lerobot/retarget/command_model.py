@@ -144,13 +144,15 @@ class CommandModel:
             The effective command and its derivative by the command. Shapes (..., k).
         """
         reach = self.space.compute_max_rate(mode, executed) * dt
-        reached = np.clip(command - executed, -reach, reach)
+        asked = command - executed
+        reached = np.minimum(np.maximum(asked, -reach), reach)
+        inside = np.abs(asked) <= reach
+        if mode is Mode.STATIONARY:  # nothing drives
+            return executed + reached, inside.astype(float)
         ramp = np.abs(reached) / np.maximum(reach, 1e-12)  # share of the time spent on the ramp
         mean = reached * (1 - ramp / 2)
-        inside = np.abs(command - executed) <= reach
-        drives = self._is_velocity & (mode is Mode.MOBILE)
-        slope = np.where(drives, 1 - ramp, 1.0) * inside
-        return executed + np.where(drives, mean, reached), slope
+        slope = np.where(self._is_velocity, 1 - ramp, 1.0) * inside
+        return executed + np.where(self._is_velocity, mean, reached), slope
 
     def extrapolate(
         self,

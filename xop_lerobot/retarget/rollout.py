@@ -158,8 +158,10 @@ class PolicyRollout:
         """Sensors at the start. Shape (nsensordata,)."""
         data = self._start
         data.qpos[:], data.qvel[:] = qpos, qvel
-        mujoco.mj_fwdPosition(self.model, data)
+        # All that sensors of places and velocities need; no contacts, no inertia.
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
         mujoco.mj_sensorPos(self.model, data)
-        mujoco.mj_fwdVelocity(self.model, data)
+        mujoco.mj_comVel(self.model, data)
         mujoco.mj_sensorVel(self.model, data)
         return data.sensordata

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
@@ -30,17 +32,18 @@ class FallCost(Cost):
     def find_falls(self, evaluation: Evaluation) -> np.ndarray:
         """Which samples count as fallen at some predicted step. Shape (K,), bool."""
         base = evaluation.qpos[:, 1:, :7]
-        fallen = (_compute_tilt(base) > self.tilt) | (base[..., 2] < self.height)
+        fallen = (_compute_upright(base) < math.cos(self.tilt)) | (base[..., 2] < self.height)
         return fallen.any(axis=1)
 
     def compute(self, evaluation: Evaluation) -> np.ndarray:
         """Cost of every sample. Shape (K,)."""
         base = evaluation.qpos[:, 1:, :7]
-        excess = np.square(np.maximum(0, _compute_tilt(base) - self.safe_tilt))
+        tilt = np.arccos(np.clip(_compute_upright(base), -1, 1))
+        excess = np.square(np.maximum(0, tilt - self.safe_tilt))
         excess += np.square(np.maximum(0, self.safe_height - base[..., 2]))
         return evaluation.weights.fall * excess.mean(axis=1)
 
 
-def _compute_tilt(base: np.ndarray) -> np.ndarray:
-    """Angle of the base's Z to the vertical [rad]. Shape (..., 7) -> (...)."""
-    return np.arccos(np.clip(1 - 2 * (base[..., 4] ** 2 + base[..., 5] ** 2), -1, 1))
+def _compute_upright(base: np.ndarray) -> np.ndarray:
+    """Cosine of the angle of the base's Z to the vertical. Shape (..., 7) -> (...)."""
+    return 1 - 2 * (base[..., 4] ** 2 + base[..., 5] ** 2)
