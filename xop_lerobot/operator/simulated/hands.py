@@ -213,6 +213,24 @@ def nudge(mind: Mind, errors: Mapping[str, np.ndarray], slowness: float = 1.0) -
     yield from move_hands(mind, goals, slowness)
 
 
+def shift_hands(mind: Mind, way: np.ndarray, speed: float) -> Doing:
+    """Move both hands alike, so that what they hold stays held.
+
+    Args:
+        mind: Who moves.
+        way: In the robot's world [m]. Shape (3,).
+        speed: Mean speed of the hands [m/s].
+    """
+    own = mind.belief.vector_to_own(way)
+    length = float(np.linalg.norm(own))
+    own = own + mind.scatter(length)
+    room = mind.body.compute_hands_in_room()
+    goals = {side: np.array([*(room[i][:3] + own), *room[i][3:]]) for i, side in enumerate(SIDES)}
+    duration = max(length / speed, compute_reach_time(mind, length))
+    mind.body.move(mind.body.with_hands_in_room(mind.body.posture, goals), duration)
+    yield from mind.finish()
+
+
 def move_hands(mind: Mind, goals: Mapping[str, np.ndarray], slowness: float = 1.0) -> Doing:
     """Move hands to poses of the own room, in one movement."""
     body = mind.body

@@ -16,6 +16,8 @@ LAG = 0.4
 """How long a person still looks when the own turn is over: the robot may be behind [s]."""
 MODE_WAIT = 1.4
 """Longest wait for the display to show the other mode [s]."""
+GLANCE = 0.9
+"""Turn of the head with which a person looks to a side [rad]."""
 MODE_TRIES = 6
 """How often a person tries a double pinch before giving up."""
 TURN_FIRST = 0.35
@@ -37,6 +39,18 @@ def find(mind: Mind, *names: str) -> Doing:
     yield from _search(mind, names)
     if not _knows(mind, names):
         raise GaveUp(f"did not find {', '.join(names)}")
+
+
+def glance(mind: Mind, *names: str) -> Doing:
+    """Look to both sides without a step, for what is not known yet; then ahead again."""
+    for angle in (*(mind.rng.choice([-1, 1]) * np.array([GLANCE, -GLANCE])), 0.0):
+        if _knows(mind, names) and angle:
+            continue
+        last = mind.body.posture
+        way = abs(float(angle) - float(last.look[0]))
+        end = replace(last, look=np.array([float(angle), last.look[1]]))
+        mind.body.move(end, 1.875 * way / mind.person.turn_speed)
+        yield from _search(mind, names if angle else ())
 
 
 def set_mode(mind: Mind, mode: Mode) -> Doing:
@@ -144,14 +158,14 @@ def _at(mind: Mind, x: float, y: float, yaw: float) -> Posture:
 def _search(mind: Mind, names: tuple[str, ...]) -> Doing:
     """Look while turning; what comes into view ends the turn."""
     while mind.body.is_moving:
-        if _knows(mind, names):
+        if names and _knows(mind, names):
             yield from mind.pause(mind.person.decision_s)
             mind.body.halt()
             yield from mind.settle("head")
             return
         yield
     limit = mind.time + mind.person.delay + LAG
-    while mind.time < limit and not _knows(mind, names):
+    while mind.time < limit and not (names and _knows(mind, names)):
         yield
 
 
