@@ -33,15 +33,14 @@ logger = logging.getLogger(__name__)
 
 PAGE = "index.html"
 _STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem; color: #222;
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 84rem; color: #222;
        padding: 0 1rem; }
 table { border-collapse: collapse; margin: 0.7rem 0; display: block; overflow-x: auto; }
-th, td { padding: 0.25rem 0.6rem; border-bottom: 1px solid #ddd; text-align: left;
+th, td { padding: 0.2rem 0.5rem; font-size: 14px; border-bottom: 1px solid #ddd; text-align: left;
          white-space: nowrap; }
 th { border-bottom: 2px solid #888; }
 td small { color: #777; }
 tr.theirs td { color: #7a5c1e; background: #fdf8ec; }
-tr.theirs:first-of-type td { border-top: 2px solid #c9a24a; }
 tr.absent td { color: #999; }
 img { max-width: 100%; }
 figure { display: inline-block; margin: 0.4rem; vertical-align: top; }
@@ -121,15 +120,20 @@ def _make_head(cells: Sequence[Cell], found: Sequence[Sequence[Mapping[str, Any]
 
 
 def label_cell(cell: Cell, cells: Iterable[Cell]) -> str:
-    """Method and variant, with the low-level policy where the cells have several."""
+    """Method and variant, with the low-level policy where the cells have it with several."""
     setup = cell.setup
     label = f"{setup.method} {setup.variant}".strip()
-    several = len({each.setup.low_level for each in cells}) > 1
-    return f"{label} ({setup.low_level})" if several else label
+    same = {
+        each.setup.low_level
+        for each in cells
+        if (each.setup.method, each.setup.variant) == (setup.method, setup.variant)
+    }
+    return f"{label} ({setup.low_level})" if len(same) > 1 else label
 
 
-_COLUMNS = ("method", "success", "pickup", "collision", "falls", "CT [s]", "ABP [W]",
-            "tilt [rad]", "jerk [m/s³]", "head, hands error [cm]", "solve p99 [ms]")  # fmt: skip
+_COLUMNS = ("success", "pickup", "collision", "falls", "CT [s]", "ABP [W]", "tilt [rad]",
+            "jerk [m/s³]", "head, hands error [cm]", "solve p99 [ms]")  # fmt: skip
+_NOTHING = "–"
 
 
 def _make_table(
@@ -139,32 +143,39 @@ def _make_table(
     robot: str,
     task: str,
 ) -> str:
-    lines = ["<table><thead><tr>"]
-    lines += [f"<th>{_escape(name)}</th>" for name in _COLUMNS]
-    lines.append("</tr></thead><tbody>")
+    """The table of one task of one robot; columns in which nothing stands are left out."""
+    lines: list[tuple[str, str, list[str]]] = []  # class, title and fields of each row
     for cell, trials, row in zip(cells, found, rows, strict=True):
-        lines.append(_make_row(cell, cells, trials, row))
-    lines += [_make_published_row(each) for each in find_published(robot, task)]
-    lines.append("</tbody></table>")
-    return "".join(lines)
+        title = f"<b>{_escape(label_cell(cell, cells))}</b><br><small>"
+        title += f"{_escape(get_method(cell.setup.method).title)}</small>"
+        if trials:
+            lines.append(("ours", title, _make_fields(trials, row)))
+        else:
+            lines.append(("absent", title, [_escape(row["note"] or "not run yet")]))
+    for each in find_published(robot, task):
+        title = f"{each.method} {each.variant}".strip() + f" ({each.low_level})"
+        title = f"{_escape(title)}<br><small>the paper, {each.setting}</small>"
+        lines.append(("theirs", title, _make_published_fields(each)))
+    whole = [fields for _, _, fields in lines if len(fields) == len(_COLUMNS)]
+    kept = [i for i in range(len(_COLUMNS)) if any(fields[i] != _NOTHING for fields in whole)]
+    head = "".join(f"<th>{_escape(name)}</th>" for name in ("method", *(_COLUMNS[i] for i in kept)))
+    body = []
+    for kind, title, fields in lines:
+        if len(fields) == 1:
+            inside = f'<td colspan="{max(len(kept), 1)}">{fields[0]}</td>'
+        else:
+            inside = "".join(f"<td>{fields[i]}</td>" for i in kept)
+        body.append(f'<tr class="{kind}"><td>{title}</td>{inside}</tr>')
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
-def _make_row(
-    cell: Cell,
-    cells: Sequence[Cell],
-    trials: Sequence[Mapping[str, Any]],
-    row: Mapping[str, Any],
-) -> str:
-    title = f"<b>{_escape(label_cell(cell, cells))}</b><br><small>"
-    title += f"{_escape(get_method(cell.setup.method).title)}</small>"
-    if not trials:
-        note = _escape(row["note"] or "not run yet")
-        return (
-            f'<tr class="absent"><td>{title}</td><td colspan="{len(_COLUMNS) - 1}">{note}</td></tr>'
-        )
-    fields = [title]
-    fields += [
-        _format_count(row[n], len(trials)) for n in ("success", "pickup", "collision", "falls")
+def _make_fields(trials: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> list[str]:
+    """Fields of a row of ours, in the order of the columns."""
+    count = len(trials)
+    has_pickup = row["task"] == "box_pick_and_place"
+    fields = [
+        _NOTHING if name == "pickup" and not has_pickup else _format_count(row[name], count)
+        for name in ("success", "pickup", "collision", "falls")
     ]
     for name, prefix, digits in (
         ("completion_s", "ct", 1), ("abp", "abp", 2), ("tilt", "tilt", 3), ("jerk", "jerk", 0)
@@ -175,25 +186,22 @@ def _make_row(
             field += f"<br><small>({row['abp_signed_mean']:+.2f} signed)</small>"
         fields.append(field)
     errors = (row["head_error_mean"], row["hands_error_mean"])
-    fields.append(", ".join("–" if e is None else f"{e * 100:.1f}" for e in errors))
+    fields.append(", ".join(_NOTHING if e is None else f"{e * 100:.1f}" for e in errors))
     p99 = row["plan_p99_ms_mean"]
-    fields.append("–" if p99 is None else f"{p99:.0f}")
-    return "<tr>" + "".join(f"<td>{field}</td>" for field in fields) + "</tr>"
+    fields.append(_NOTHING if p99 is None else f"{p99:.0f}")
+    return fields
 
 
-def _make_published_row(row: PublishedRow) -> str:
-    label = f"{row.method} {row.variant}".strip()
-    title = (
-        f"{_escape(label)} ({_escape(row.low_level)})<br><small>the paper, {row.setting}</small>"
-    )
-    fields = [title]
-    for count in (row.success, row.pickup, row.collision):
-        fields.append("–" if count is None else f"{count}/{PUBLISHED_TRIALS}")
-    fields.append("–")
+def _make_published_fields(row: PublishedRow) -> list[str]:
+    """Fields of a row of the paper's, in the order of the columns."""
+    fields = [
+        _NOTHING if count is None else f"{count}/{PUBLISHED_TRIALS}"
+        for count in (row.success, row.pickup, row.collision, None)
+    ]
     for spread, digits in ((row.ct, 1), (row.abp, 2), (row.tilt, 2), (row.jerk, 0)):
-        fields.append("–" if spread is None else f"{spread[0]:.{digits}f} ± {spread[1]:.{digits}f}")
-    fields += ["–", "–"]
-    return '<tr class="theirs">' + "".join(f"<td>{field}</td>" for field in fields) + "</tr>"
+        text = _NOTHING if spread is None else f"{spread[0]:.{digits}f} ± {spread[1]:.{digits}f}"
+        fields.append(text)
+    return [*fields, _NOTHING, _NOTHING]
 
 
 def _format_count(count: int, trials: int) -> str:
@@ -205,7 +213,7 @@ def _format_mean(
     mean: float | None, std: float | None, values: Sequence[float], digits: int
 ) -> str:
     if mean is None or std is None:
-        return "–"
+        return _NOTHING
     interval: Interval = compute_mean_interval(values)
     return (
         f"{mean:.{digits}f} ± {std:.{digits}f}<br>"

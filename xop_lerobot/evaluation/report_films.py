@@ -6,14 +6,21 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from xop_lerobot.errors import BadValue
 from xop_lerobot.evaluation.strip import build_film, write_video
 from xop_lerobot.evaluation.trial import Film, TrialSetup, make_stage
+from xop_lerobot.transforms import quat_rotate
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = "task"
+LOOK_HEIGHT, DISTANCE = 0.75, 2.6
+"""Where a camera that follows a robot looks over the ground, and from how far [m]."""
+SMOOTHING_S = 0.7
+"""Standard deviation of the filter of the way that it follows [s]."""
 
 
 def load_film(path: Path) -> Film:
@@ -57,11 +64,31 @@ def render_film(
                     f"the scene of '{setup.task}' has {name} of shape {there}, the trial was "
                     f"recorded with {kept}. Run it again with --fresh"
                 )
-        for rows in zip(film.qpos, film.mocap_pos, film.mocap_quat, strict=True):
+        ways = None if _has_walls(plant.model) else _smooth(film.qpos[:, :2], film.fps)
+        for index, rows in enumerate(zip(film.qpos, film.mocap_pos, film.mocap_quat, strict=True)):
             data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = rows
+            if ways is not None:
+                _follow(plant.model, camera, ways[index])
             yield plant.render(camera)
     finally:
         plant.close()
+
+
+def _has_walls(model: mujoco.MjModel) -> bool:
+    """Whether the camera must stay in its room."""
+    return any(model.geom(index).name.startswith("wall_") for index in range(model.ngeom))
+
+
+def _smooth(way: np.ndarray, fps: int) -> np.ndarray:
+    """A way without its sway, for a camera to follow. Shape (p, 2)."""
+    return gaussian_filter1d(way.astype(float), SMOOTHING_S * fps, axis=0, mode="nearest")
+
+
+def _follow(model: mujoco.MjModel, camera: str, place: np.ndarray) -> None:
+    """Move a camera that stands in the world so that it looks at the robot from near."""
+    index = model.camera(camera).id
+    back = quat_rotate(model.cam_quat[index], np.array([0.0, 0.0, 1.0]))
+    model.cam_pos[index] = np.array([*place, LOOK_HEIGHT]) + DISTANCE * back
 
 
 def write_film(
