@@ -241,6 +241,30 @@ def test_tables_of_what_is_there(tmp_path, capsys):
     assert "2 trials in" in printed.err and "--fresh runs them again" in printed.err
 
 
+def test_the_page_is_whole_and_tells_whose_figures_are_whose(tmp_path):
+    results = Results(tmp_path / "out")
+    other = TrialSetup("g1", "dual_point_touch", "mpc").resolved
+    for seed in range(3):
+        results.append(make_trial(SETUP, seed, success=seed > 0, failure="the robot <fell>"))
+        results.append(make_trial(other, seed))
+    page = tmp_path / "report" / "index.html"
+    code = main(
+        [*("--robot", "g1", "--task", "dual_point_touch", "--methods", "mpc,direct,direct_amo")]
+        + [*("--trials", "3", "--out", str(tmp_path / "out"), "--no-run")]
+        + [*("--report", str(page.parent))]
+    )
+    assert code == 0
+    text = page.read_text()
+    assert text.count("data:image/png;base64,") == 4
+    assert 'src="http' not in text and "href=" not in text  # it needs no other file
+    assert "2/3<br>" in text and "21% to 94%" in text  # Wilson's of 2 of 3
+    assert "weights not present" in text
+    theirs = [row for row in text.split("<tr") if "26.6 ± 6.6" in row]
+    assert len(theirs) == 1 and 'class="theirs"' in theirs[0] and "the paper" in theirs[0]
+    rows = json.loads((page.parent / "table.json").read_text())
+    assert [row["success"] for row in rows] == [3, 2, 0]
+
+
 def test_a_whole_study_can_be_narrowed(tmp_path, capsys):
     path = str(_repository() / "configs" / "paper_tables.yaml")
     out = ["--out", str(tmp_path), "--no-run"]
