@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
+from grasp import Grasp
 from reachability import find_posture
 
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.tasks import box_pick_and_place as box_task
 from xop_lerobot.tasks import dual_point_touch as touch
 from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import find_room, make_direction, measure_reach
 from xop_lerobot.tasks.stage import Stage
+from xop_lerobot.tasks.touching import Touching, compute_tilt
+from xop_lerobot.transforms import make_pose, quat_from_rpy
 
 ROBOTS = ("g1", "rby1")
 
@@ -91,3 +96,138 @@ def test_low_points_ask_for_a_squat():
     lowest = min(left[2] for left, _, _ in draw_points("g1", range(40)))
     # From the shoulder down and forward to where the palms are at rest.
     assert lowest < reach.shoulder - np.sqrt(reach.arm**2 - 0.2**2)
+
+
+# box pick-and-place
+
+
+def make_box_stage(robot: str, seed: int = 0) -> Stage:
+    stage = Stage(make_morphology(robot), "box_pick_and_place")
+    stage.plant.reset(seed)
+    stage.reset(seed)
+    return stage
+
+
+def put_box(stage: Stage, position: np.ndarray, tilt: float = 0.0) -> None:
+    pose = make_pose(position, quat_from_rpy(tilt, 0, 0))
+    stage.plant.set_object_pose("box", pose)
+
+
+def run(stage: Stage, seconds: float) -> None:
+    for _ in range(round(seconds / 0.02)):
+        stage.plant.step(0.02)
+        stage.update()
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_furniture_stands_free_of_the_robot_and_of_each_other(robot):
+    stage = make_box_stage(robot)
+    for seed in range(30):
+        stage.plant.reset(seed)
+        stage.reset(seed)
+        assert stage.plant.measure().contacts == ()
+        columns = [stage.plant.model.geom(f"{name}_top").id for name in ("support", "table")]
+        gap = mujoco.mj_geomDistance(stage.plant.model, stage.plant.data, *columns, 3.0, None)
+        assert gap > 0.2
+        seen = stage.task.objects
+        distance = np.linalg.norm(seen["spot"].pose[:2])
+        assert box_task.TABLE_DISTANCE[0] <= distance <= box_task.TABLE_DISTANCE[1]
+        # The spot is marked where a box fits onto the top.
+        assert abs(seen["spot"].pose[2] - seen["table"].pose[2] - box_task.TOP) < 1e-9
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_box_rests_on_its_support_and_stays_there(robot):
+    stage = make_box_stage(robot)
+    before = stage.plant.get_object_pose("box")
+    touching = Touching(stage.plant, "box")
+    run(stage, 0.4)  # without a policy, a biped falls soon after
+    assert touching.find() == {"support"}
+    assert np.linalg.norm(stage.plant.get_object_pose("box") - before) < 0.003
+    assert not stage.status.picked_up
+
+
+def test_furniture_is_in_the_room_with_space_for_the_robot():
+    stage = make_box_stage("rby1")
+    low, high = find_room(stage.plant.model)
+    for seed in range(50):
+        stage.reset(seed)
+        for name in ("table", "support"):
+            seen = stage.task.objects[name]
+            reach = np.linalg.norm(seen.size[:2])
+            assert (seen.pose[:2] - reach > low).all()
+            assert (seen.pose[:2] + reach < high).all()
+
+
+def test_planner_is_told_of_columns_not_of_tops():
+    names = {obstacle.name for obstacle in make_box_stage("rby1").obstacles}
+    assert names >= {"support_column", "table_column", "wall_front"}
+    assert not names & {"support_top", "table_top", "box"}
+
+
+def test_box_on_the_floor_is_lost():
+    stage = make_box_stage("g1")
+    put_box(stage, np.array([2.0, 0, box_task.BOX[2]]))
+    run(stage, 0.1)
+    assert stage.status.failure == "the box was dropped"
+    assert stage.status.done
+    assert not stage.status.success
+
+
+def test_box_on_the_table_counts_only_after_it_was_picked_up():
+    stage = make_box_stage("g1")
+    spot = stage.task.objects["spot"].pose[:3] + [0, 0, box_task.BOX[2]]
+    put_box(stage, spot)
+    run(stage, 1.5)
+    assert not stage.status.success
+    stage.task._picked_up = True
+    run(stage, 0.9)
+    assert not stage.status.success
+    run(stage, 0.3)
+    assert stage.status.success
+
+
+def test_box_that_floats_is_not_picked_up():
+    """Held up by nobody: only the robot may bear it."""
+    stage = make_box_stage("g1")
+    stage.plant.model.opt.gravity[:] = 0
+    put_box(stage, np.array([0.6, 0, 1.4]))
+    run(stage, 3.5)
+    assert not stage.status.picked_up
+    assert stage.status.figures["lift_m"] > 0.3
+
+
+def test_hands_may_touch_the_table_and_other_parts_may_not():
+    stage = make_box_stage("rby1")
+    stage.plant.take_touches = lambda: {
+        ("ee_left", "table"), ("ee_finger_r1", "support"), ("link_left_arm_3", "table"),
+        ("left_hand", "floor"), ("ee_left", "box"), ("ee_left", "wall_left"),
+    }  # fmt: skip
+    stage.update()
+    assert set(stage.status.collisions) == {("link_left_arm_3", "table"), ("ee_left", "wall_left")}
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_robot_squeezes_lifts_and_holds_the_box(robot):
+    """By arm kinematics alone, through policy and physics: five seconds without slipping."""
+    grasp = Grasp(robot)
+    log = grasp.take(hold_s=5.0)
+    held = slice(-250, None)
+    assert grasp.stage.status.picked_up
+    assert all(touched == {"robot"} for touched in log.touched[held])
+    boxes = np.stack(log.box[held])
+    assert (boxes[:, 2] - grasp.middle[2]).min() > box_task.LIFT
+    assert max(compute_tilt(box[3:]) for box in boxes) < np.radians(20)
+    assert np.median(log.speed[held]) < 0.02
+    assert grasp.stage.status.collisions == ()
+    assert not grasp.loop.state.fallen
+    # Hands do not sink into it.
+    contact = grasp.stage.plant.data.contact
+    assert contact.dist.min() > -0.015
+
+
+def test_hands_that_do_not_press_lift_nothing():
+    grasp = Grasp("rby1", press=-0.02)
+    grasp.take(hold_s=1.0)
+    assert not grasp.stage.status.picked_up
+    assert grasp.stage.status.figures["lift_m"] < 0.005

@@ -12,6 +12,10 @@ from xop_lerobot.retarget.arm_ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
 from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
 from xop_lerobot.state import FRAMES, Goal, RobotState
 
+BIAS_TIME = 1.5
+"""Time in which offsets of the arms are learned [s]. With 0.5 s the arms of G1, which are soft,
+swing a box that they hold between them."""
+
 
 class ArmDriver:
     """Computes arm targets, and knows the last ones so that they go on without a step.
@@ -27,7 +31,7 @@ class ArmDriver:
     def __init__(self, morphology: Morphology) -> None:
         self.morphology = morphology
         self.ik = ArmIk(morphology)
-        self.bias = ArmBias(self.ik.joint_range)
+        self.bias = ArmBias(self.ik.joint_range, time_constant=BIAS_TIME)
         self._joints = [joint for arm in morphology.arms for joint in arm.joints]
         self.forget()
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import mujoco
 
 NAME = "task"
-OPEN = ((2.9, -2.3, 2.0), (0.35, 0.0, 0.55), 45.0)
+OPEN = ((2.6, -2.2, 1.9), (0.2, 0.1, 0.6), 45.0)
 """Where the camera is, what it looks at [m], and its vertical field of view [deg]."""
 IN_ROOM = ((2.1, -2.1, 2.4), (0.0, 0.0, 0.5), 66.0)
 """The same in a room of 4.4 m and more: in its corner, under the ceiling."""

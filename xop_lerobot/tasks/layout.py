@@ -87,3 +87,51 @@ def find_room(model: mujoco.MjModel) -> np.ndarray | None:
             [front[0] - front_half[0], left[1] - left_half[1]],
         ]
     )
+
+
+@dataclass(frozen=True)
+class Pad:
+    """The side of a hand that presses, in the axes of its palm's site.
+
+    Attributes:
+        forward: Middle of the flat of the hand ahead of the site [m].
+        depth: Its surface beyond the site, out of the palm [m].
+        wrist_end: Where the arm ends and the hand begins, ahead of the site [m]; negative.
+    """
+
+    forward: float
+    depth: float
+    wrist_end: float
+
+
+def measure_pad(morphology: Morphology) -> Pad:
+    """Measure the left hand: the box on it that stands out of the palm the farthest.
+
+    Among boxes that stand out alike (within two centimetres), the largest counts. A hand without
+    boxes has its pad at the palm's site.
+    """
+    model = morphology.build_spec("full").compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = morphology.standing_qpos()
+    mujoco.mj_kinematics(model, data)
+    site = model.site(find_palms(morphology, model)["left_palm"]).id
+    axes, origin = data.site_xmat[site].reshape(3, 3), data.site_xpos[site]
+    hand = int(model.site_bodyid[site])
+    arm = {int(model.joint(joint).bodyid[0]) for joint in morphology.arms[0].joints} - {hand}
+    pads, wrist_end = [], -math.inf
+    for geom in np.flatnonzero(model.geom_contype):
+        turn = axes.T @ data.geom_xmat[geom].reshape(3, 3)
+        middle, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        centre = axes.T @ (data.geom_xpos[geom] - origin) + turn @ middle
+        extent = np.abs(turn) @ half
+        body = int(model.geom_bodyid[geom])
+        if body in arm:
+            wrist_end = max(wrist_end, float(centre[0] + extent[0]))
+        elif body == hand and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+            pads.append((float(extent[2] - centre[2]), float(half.prod()), float(centre[0])))
+    if not pads:
+        return Pad(0.0, 0.0, wrist_end)
+    farthest = max(pad[0] for pad in pads)
+    alike = [pad for pad in pads if pad[0] > farthest - 0.02]  # noqa: PLR2004 in the docstring
+    depth, _, forward = max(alike, key=lambda pad: pad[1])
+    return Pad(forward, depth, wrist_end)

@@ -116,6 +116,9 @@ def get_task(name: str) -> type[Task]:
     Raises:
         UnknownName: Listing the known tasks.
     """
-    from xop_lerobot.tasks import dual_point_touch  # noqa: F401, PLC0415 it registers itself
+    from xop_lerobot.tasks import (  # noqa: F401, PLC0415 they register themselves
+        box_pick_and_place,
+        dual_point_touch,
+    )
 
     return TASKS[name]

@@ -1,0 +1,220 @@
+"""Box pick-and-place: with both hands from a support onto a table a few steps away."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.operator.view import SeenObject
+from xop_lerobot.tasks import furniture
+from xop_lerobot.tasks.hold import Hold
+from xop_lerobot.tasks.layout import make_direction, measure_pad, measure_reach
+from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
+from xop_lerobot.transforms import make_pose, quat_conjugate, quat_from_yaw, quat_rotate
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from xop_lerobot.morphology.morphology import Morphology
+    from xop_lerobot.plant.simulation import Simulation
+
+BOX = (0.08, 0.13, 0.10)
+"""Half the edges of the box: deep, wide, high [m]."""
+BOX_MASS = 0.6
+"""A cardboard box with little in it [kg]."""
+BOX_FRICTION = (0.7, 0.02, 0.001)
+"""Cardboard on the rubber of hands and mats: sliding 0.5 to 0.8 in tables of friction; torsion
+over patches of some centimetres [m], rolling [m]."""
+COMPLIANCE = (0.04, 1.0)
+"""MuJoCo's time constant [s] and damping ratio of its contacts: a side of the box and the rubber
+of a hand give by about a centimetre under 100 N. Stiffer ones let the grip of a stiff arm go from
+nothing to its full torque within millimetres."""
+SEEN = 0.005
+"""The box is drawn so much narrower on either side, since its sides give [m]."""
+
+SUPPORT = (0.14, 0.17)
+"""Half the edges of the support's top: deep, wide [m]."""
+TABLE = (0.22, 0.34)
+"""Half the edges of the table's top: deep, wide [m]."""
+TOP = 0.02
+"""Half the thickness of both tops [m]."""
+COLUMN = 1.2
+"""Length of the columns, of which the lower end is under the floor [m]."""
+SPOT = 0.02
+"""The marked spot is so much farther from the edge than the box's half depth [m]."""
+
+GAP = (0.25, 0.40)
+"""From the palms at rest to the middle of the box, at the start [m]."""
+BEARING = 0.3
+"""Largest bearing of the box [rad]."""
+TURN = (1.2, 1.9)
+"""Bearing of the table from the start, to the left or to the right [rad]."""
+TABLE_DISTANCE = (0.95, 1.15)
+"""From the start to the marked spot [m]."""
+LEVELS = {"support": (-0.03, 0.03), "table": (-0.06, 0.0)}
+"""Heights of the tops about that at which the box's middle is where palms are at rest [m]."""
+
+WRIST_GAP = 0.01
+"""Between the end of the arm, which is thicker than the hand, and the box [m]."""
+LIFT, LIFTED_S = 0.03, 3.0
+"""Picked up is so high over where it stood [m], for so long [s], held by the robot alone."""
+PLACED_S, UPRIGHT, STILL = 1.0, math.radians(15), 0.02
+"""Placed is upright [rad], still [m/s] and let go on the table for so long [s]."""
+
+WOOD, STEEL, CARDBOARD = (0.72, 0.55, 0.38, 1), (0.35, 0.36, 0.38, 1), (0.78, 0.60, 0.40, 1)
+PALE, MARK, TAPE = (0.82, 0.80, 0.76, 1), (0.12, 0.55, 0.30, 1), (0.90, 0.84, 0.70, 1)
+
+
+@TASKS.register("box_pick_and_place")
+class BoxPickAndPlace(Task):
+    """Squeeze a box between both hands, lift it, carry it to a table, put it down, let go.
+
+    The box stands on a support before the robot, a step out of its reach; the table is to one
+    side. Both tops overhang their columns, so that a robot can come close.
+    """
+
+    name = "box_pick_and_place"
+    instruction = "Pick up the box with both hands and put it on the green mark of the table."
+    time_limit = 150.0
+    scenes: Mapping[str, str] = {"g1": "empty", "rby1": "small_room"}
+    furniture = ("support", "table")
+    handled = ("support", "table")
+    passable = ("support_top", "table_top")
+
+    def __init__(self, morphology: Morphology) -> None:
+        super().__init__(morphology)
+        self.reach, self.pad = measure_reach(morphology), measure_pad(morphology)
+        self._lifted, self._placed = Hold(LIFTED_S), Hold(PLACED_S)
+
+    @property
+    def hints(self) -> Mapping[str, float]:
+        """How to take hold of the box.
+
+        - `palm_forward`: the palms' sites go so far beyond the box's middle, along the hands: as
+          far as possible, but the arms, which are thicker than the hands, must not touch it.
+        - `palm_outside`: a palm's site is so far outside of the box's side when the hand touches.
+        - `press`: wrist goals go so far further in, which presses the box.
+        """
+        return {
+            "palm_forward": min(-self.pad.forward, -self.pad.wrist_end - BOX[0] - WRIST_GAP),
+            "palm_outside": self.pad.depth,
+            "press": PRESS.get(self.morphology.name, 0.05),
+        }
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add support, table with its mark, and box."""
+        for index, (name, half, colour) in enumerate(
+            (("support", SUPPORT, PALE), ("table", TABLE, WOOD))
+        ):
+            body = furniture.add_furniture_body(spec, name, index)
+            furniture.add_solid(body, f"{name}_top", "box", (*half, TOP), (0, 0, -TOP), colour)
+            column = (0.06, half[1] * 0.6, COLUMN / 2)
+            position = (half[0] - 0.08, 0, -2 * TOP - COLUMN / 2)
+            furniture.add_solid(body, f"{name}_column", "box", column, position, STEEL)
+        mark = (BOX[0], BOX[1], 0.001)
+        furniture.add_look(spec.body("table"), "spot", "box", mark, (self._spot_offset, 0, 0), MARK)
+        box = furniture.add_object_body(spec, "box", BOX[2])
+        geom = furniture.add_solid(box, "box", "box", BOX, (0, 0, 0), (0, 0, 0, 0), BOX_FRICTION)
+        look = (BOX[0], BOX[1] - SEEN, BOX[2])
+        furniture.add_look(box, "box_look", "box", look, (0, 0, 0), CARDBOARD)
+        geom.mass, geom.condim, geom.priority = BOX_MASS, 4, 1
+        geom.solref = COMPLIANCE
+        geom.conaffinity = furniture.OBJECT_CONTACT["conaffinity"]
+        tape = (0.02, BOX[1] - SEEN + 0.0005, BOX[2] + 0.0005)
+        furniture.add_look(box, "box_tape", "box", tape, (0, 0, 0), TAPE)
+
+    @property
+    def _spot_offset(self) -> float:
+        """From the middle of the table to the spot, away from the robot [m]."""
+        return BOX[0] + SPOT - TABLE[0]
+
+    def bind(self, plant: Simulation) -> None:
+        """Find what touches the box."""
+        self.plant = plant
+        self._touching = Touching(plant, "box")
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Place support and box before the robot, and the table to one side."""
+        level = self.reach.height - BOX[2]
+        bearing = rng.uniform(-BEARING, BEARING)
+        facing = bearing + rng.uniform(-BEARING, BEARING) / 2
+        box = (self.reach.forward + rng.uniform(*GAP)) * make_direction(bearing)
+        top = level + rng.uniform(*LEVELS["support"])
+        offset = SUPPORT[0] - BOX[0] - SPOT
+        quat = quat_from_yaw(facing)
+        furniture.place(
+            self.plant, "support", box + offset * make_direction(facing) + [0, 0, top], quat
+        )
+        self.plant.set_object_pose("box", make_pose(box + [0, 0, top + BOX[2]], quat))
+        self._rest = top + BOX[2]
+
+        turn = rng.choice([-1, 1]) * rng.uniform(*TURN)
+        spot = rng.uniform(*TABLE_DISTANCE) * make_direction(turn)
+        facing = turn + rng.uniform(-BEARING, BEARING) / 2
+        top = level + rng.uniform(*LEVELS["table"])
+        middle = spot - self._spot_offset * make_direction(facing) + [0, 0, top]
+        furniture.place(self.plant, "table", middle, quat_from_yaw(facing))
+
+        self._lifted.reset()
+        self._placed.reset()
+        self._pickup_time = math.nan
+        self._picked_up = self._success = False
+        self._failure = ""
+
+    def update(self) -> TaskStatus:
+        """Whether the box is held up, stands on the table, or is lost."""
+        touched, time = self._touching.find(), self.plant.time
+        pose = self.plant.get_object_pose("box")
+        lift, tilt = pose[2] - self._rest, compute_tilt(pose[3:])
+        speed = compute_speed(self.plant, "box")
+        held = touched == {ROBOT} and lift > LIFT
+        if self._lifted.update(time, held) and not self._picked_up:
+            self._picked_up, self._pickup_time = True, time
+        stands = touched == {"table"} and tilt < UPRIGHT and speed < STILL
+        stands = stands and self._picked_up and self._is_over_table(pose[:3])
+        self._success |= self._placed.update(time, stands)
+        if "floor" in touched and not self._success:
+            self._failure = "the box was dropped"
+        spot = self.objects["spot"].pose
+        figures = {
+            "lift_m": lift,
+            "held_s": self._lifted.duration,
+            "tilt_rad": tilt,
+            "speed_m_s": speed,
+            "spot_distance_m": math.dist(spot[:2], pose[:2]),
+        }
+        if self._picked_up:
+            figures["pickup_time_s"] = self._pickup_time
+        return TaskStatus(
+            self._success, self._success or bool(self._failure), self._failure,
+            self._picked_up, {name: float(value) for name, value in figures.items()},
+        )  # fmt: skip
+
+    def _is_over_table(self, position: np.ndarray) -> bool:
+        table = furniture.get_body_pose(self.plant, "table")
+        local = quat_rotate(quat_conjugate(table[3:]), position - table[:3])
+        return bool((np.abs(local[:2]) < TABLE).all())
+
+    @property
+    def objects(self) -> Mapping[str, SeenObject]:
+        """Box, support, table (poses of their middles) and the spot on the table's top.
+
+        X points away from who faces the thing.
+        """
+        seen = {"box": SeenObject(self.plant.get_object_pose("box"), np.array(BOX))}
+        for name, half in (("support", SUPPORT), ("table", TABLE)):
+            pose = furniture.get_body_pose(self.plant, name)
+            pose[2] -= TOP
+            seen[name] = SeenObject(pose, np.array([*half, TOP]))
+        table = furniture.get_body_pose(self.plant, "table")
+        spot = table[:3] + quat_rotate(table[3:], np.array([self._spot_offset, 0, 0]))
+        seen["spot"] = SeenObject(make_pose(spot, table[3:]), np.array([BOX[0], BOX[1], 0]))
+        return seen
+
+
+PRESS = {"g1": 0.03, "rby1": 0.01}
+"""How far inside wrist goals have to be for a grip that holds, by robot [m]; see docs/tasks.md."""
