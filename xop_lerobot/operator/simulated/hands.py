@@ -22,7 +22,9 @@ from xop_lerobot.transforms import (
 
 MARGIN = 0.15
 """How far within the field of view a person wants to have what the hands work on [rad]."""
-LARGEST_NOD = 0.5
+NOD_MORE = 0.12
+"""Least further nod when a hand is not in view [rad]."""
+LARGEST_NOD = 0.6
 """Largest nod [rad]."""
 KNEES = 0.3
 """How much farther out hands work for each metre of squatting [m/m]."""
@@ -109,6 +111,8 @@ def look_at_work(mind: Mind, points: Mapping[str, np.ndarray]) -> Doing:
             angles.append(np.arctan2(-way[2], np.hypot(way[0], way[1])))
     pitch = float(quat_to_rpy(head[3:])[1])
     more = max(angles) - pitch - mind.person.view_half_angles[1] + MARGIN / 2
+    if not all(mind.eyes.sees(f"{side}_palm") for side in points):
+        more = max(more, NOD_MORE)
     body, last = mind.body, mind.body.posture
     nod = float(np.clip(last.look[1] + more, last.look[1], LARGEST_NOD))
     if nod - last.look[1] < 0.02:  # noqa: PLR2004 not worth it

@@ -130,7 +130,7 @@ class Perception:
         return max(float(np.linalg.norm(last[n][:3] - first[n][:3])) for n in names)
 
     def _perceive(self, view: View) -> None:
-        dt = view.time - self._trail[-1].time if self._trail else 0.0
+        dt = max(view.time - self._trail[-1].time, 0.0) if self._trail else 0.0
         self._trail.append(view)
         while view.time - self._trail[0].time > WINDOW + 1e-9:
             self._trail.popleft()

@@ -20,6 +20,8 @@ GLANCE = 0.9
 """Turn of the head with which a person looks to a side [rad]."""
 MODE_TRIES = 6
 """How often a person tries a double pinch before giving up."""
+STUCK_FROM, STUCK, MOST_STUCK = 0.25, 0.75, 3
+"""A leg of that length [m], of which so much is left, was in vain; as often as a person tries."""
 TURN_FIRST = 0.35
 """Angle up to which a person sets out without turning first [rad]."""
 
@@ -95,16 +97,40 @@ def go_to(
     near = person.place_tolerance if tolerance is None else tolerance
     hands = relaxed_hands(person.size) if hands is None else hands
     yield from mind.settle()
+    stuck = 0
     for leg in range(tries):
         miss, turn = compute_miss(mind, place)
         if miss <= near and abs(turn) <= person.heading_tolerance:
             return
+        own, seen = mind.body.posture.place, mind.eyes.pose("head")
         mind.note(f"leg {leg}: {100 * miss:.0f} cm, {np.degrees(turn):.0f}° to go")
         target = mind.belief.place_to_own(place)
         target[:2] += mind.scatter(miss, 2)
         target[2] += float(mind.scatter(abs(turn), 1)[0])
         yield from _walk(mind, target, hands, straight=leg % 3 == 2)  # noqa: PLR2004
-        yield from mind.settle("head", patience=2.5)
+        yield from mind.settle(patience=2.5)
+        if miss > STUCK_FROM and compute_miss(mind, place)[0] > STUCK * miss:
+            yield from _come_back(mind, own, seen)
+            stuck += 1
+            if stuck >= MOST_STUCK:
+                return
+
+
+def _come_back(mind: Mind, own: np.ndarray, seen: np.ndarray) -> Doing:
+    """Go back to as far as the robot has come along; pushing on would not help it.
+
+    Args:
+        mind: Who walked.
+        own: Where the person stood before. Shape (3,).
+        seen: Where the robot's head was then. Shape (7,).
+    """
+    mind.note("the robot does not come along")
+    head = mind.eyes.pose("head")
+    came = mind.belief.vector_to_own(head[:3] - seen[:3]) * mind.belief.scale
+    turned = wrap_angle(compute_heading(head[3:]) - compute_heading(seen[3:]))
+    target = own + np.array([came[0], came[1], float(turned)])
+    mind.body.walk(_at(mind, *target))
+    yield from mind.settle(patience=2.5)
 
 
 def compute_miss(mind: Mind, place: np.ndarray) -> tuple[float, float]:
@@ -138,7 +164,7 @@ def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, *, straight: bool) 
         bend = abs(float(wrap_angle(course - body.posture.place[2])))
         if TURN_FIRST < bend:
             body.walk(_at(mind, *body.posture.place[:2], course))
-            yield from mind.settle("head", patience=1.5)
+            yield from mind.settle(patience=1.5)
             # Turning on the spot has taken the head along; aim once more.
         body.walk(_at(mind, *target[:2], course))
         yield from mind.finish()

@@ -1,0 +1,207 @@
+"""The simulated person: sees late and in part, moves as people do, corrects, gives up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from toy_world import DT, ToyWorld, make_body
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.operator.devices import DeviceConfig, make_device
+from xop_lerobot.operator.devices.simulated import SimulatedDevice
+from xop_lerobot.operator.noise import HumanNoise
+from xop_lerobot.operator.simulated.body import Body
+from xop_lerobot.operator.simulated.perception import Perception
+from xop_lerobot.operator.simulated.person import Person, draw_person
+from xop_lerobot.operator.view import SeenObject, View
+from xop_lerobot.transforms import make_pose, quat_log, quat_multiply, quat_yaw
+from xop_lerobot.transforms import quat_conjugate as conjugate
+
+UNIT = np.array([1.0, 0, 0, 0])
+
+
+def make_points(bearing: float = 0.4, distance: float = 1.2, height: float = 0.75) -> dict:
+    middle = np.array([distance * np.cos(bearing), distance * np.sin(bearing), height])
+    left = 0.18 * np.array([-np.sin(bearing), np.cos(bearing), 0])
+    return {
+        "left_point": SeenObject(make_pose(middle + left, UNIT)),
+        "right_point": SeenObject(make_pose(middle - left, UNIT)),
+    }
+
+
+def make_person(seed: int = 0, noise: float = 1.0) -> SimulatedDevice:
+    device = make_device(DeviceConfig(type="simulated", seed=seed, noise=noise))
+    assert isinstance(device, SimulatedDevice)
+    device.connect()
+    return device
+
+
+def run_touch(world: ToyWorld, device: SimulatedDevice, limit: float = 60.0) -> float:
+    """Let the person touch both points; return the worst distance at the end [m]."""
+    held, worst = 0.0, np.inf
+    while world.time < limit and not device.is_finished(world.time):
+        world.step(device)
+        worst = max(
+            float(np.linalg.norm(world.palm(s)[:3] - world.objects[f"{s}_point"].pose[:3]))
+            for s in ("left", "right")
+        )
+        held = held + DT if worst < 0.05 else 0.0
+        world.success |= held > 3.0
+    return worst
+
+
+def show(eyes: Perception, objects: dict[str, SeenObject], until: float) -> None:
+    start = 0.0 if eyes.is_blind else eyes.time + DT
+    for time in np.arange(start, until, DT):
+        eyes.show(View(float(time), "", make_body(), objects))
+    eyes.advance(until)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"lag": 0.8}, {"drift": (0.02, -0.02)}, {"deaf": 1}],
+    ids=["follows", "slow", "drifts", "deaf"],
+)
+def test_touches_both_points_whatever_the_robot_is_like(settings: dict) -> None:
+    world, device = ToyWorld(make_points(), **settings), make_person(3)
+    assert run_touch(world, device) < 0.05
+    assert world.success
+    assert device.mind.diary[-1][1] == "done"
+
+
+def test_turns_round_for_what_is_behind() -> None:
+    world, device = ToyWorld(make_points(bearing=2.8)), make_person(1)
+    run_touch(world, device)
+    assert world.success
+    assert any("turn round" in text for _, text in device.mind.diary)
+
+
+def test_same_seed_same_person_and_another_is_another() -> None:
+    def record(seed: int) -> np.ndarray:
+        world, device = ToyWorld(make_points()), make_person(seed)
+        for _ in range(250):
+            world.step(device)
+        return np.array([frame.left_wrist for frame in world.history])
+
+    np.testing.assert_array_equal(record(5), record(5))
+    assert np.abs(record(5) - record(6)).max() > 0.01
+
+
+def test_people_differ_within_bounds() -> None:
+    people = [draw_person(np.random.default_rng(seed)) for seed in range(200)]
+    assert max(person.walk_speed for person in people) <= 0.6
+    assert max(person.turn_speed for person in people) <= 1.0
+    assert np.std([person.eye_height for person in people]) == pytest.approx(0.06, rel=0.2)
+
+
+def test_moves_no_faster_than_people_do() -> None:
+    world, device = ToyWorld(make_points(bearing=-2.0)), make_person(2, noise=0.0)
+    run_touch(world, device)
+    head = np.array([frame.head for frame in world.history])
+    place = np.linalg.norm(np.diff(head[:, :2], axis=0), axis=1) / DT
+    turn = np.abs(np.diff(np.unwrap(quat_yaw(head[:, 3:])))) / DT
+    assert 0.4 < place.max() <= 0.62
+    assert 0.5 < turn.max() <= 1.01
+    for name in ("left_wrist", "right_wrist"):
+        wrist = np.array([frame.pose(name) for frame in world.history])
+        reach = wrist[:, :3] - head[:, :3]
+        assert np.linalg.norm(np.diff(reach, axis=0), axis=1).max() / DT < 1.5
+        way = quat_log(quat_multiply(conjugate(wrist[:-1, 3:]), wrist[1:, 3:]))
+        assert np.linalg.norm(way, axis=1).max() / DT < 4.0
+
+
+def test_movements_are_smooth() -> None:
+    body = Body(Person(), HumanNoise(0, scale=0.0))
+    body.walk(replace(body.posture, place=np.array([2.0, 0.5, 1.0])))
+    places = []
+    for tick in range(160):
+        body.advance(tick / 100)
+        places.append(body.posture.place)
+    body.halt()
+    for tick in range(160, 320):
+        body.advance(tick / 100)
+        places.append(body.posture.place)
+    speed = np.diff(places, axis=0) * 100
+    assert np.abs(np.diff(speed, axis=0)).max() * 100 < 2.0  # acceleration, m/s² and rad/s²
+    assert not body.is_moving
+    np.testing.assert_array_equal(speed[-1], 0)
+
+
+def test_knows_only_after_the_delay() -> None:
+    person = Person()
+    eyes = Perception(person, np.random.default_rng(0))
+    here, there = make_pose(np.array([1.0, 0, 1]), UNIT), make_pose(np.array([1.0, 0.4, 1]), UNIT)
+    show(eyes, {"box": SeenObject(here)}, 2.0)
+    seen = eyes.pose("box").copy()
+    assert np.linalg.norm(seen[:3] - here[:3]) < 0.12
+    for time in np.arange(2.0, 2.0 + person.delay, 0.01):
+        eyes.show(View(float(time), "", make_body(), {"box": SeenObject(there)}))
+        eyes.advance(float(time))
+        assert np.linalg.norm(eyes.pose("box")[:3] - seen[:3]) < 0.03
+    eyes.advance(2.0 + person.delay + 0.05)
+    assert eyes.pose("box")[1] > 0.3
+
+
+def test_does_not_see_behind_but_remembers() -> None:
+    eyes = Perception(Person(), np.random.default_rng(0))
+    behind = {"box": SeenObject(make_pose(np.array([-1.0, 0, 1]), UNIT))}
+    show(eyes, behind, 1.0)
+    assert not eyes.knows("box")
+    show(eyes, {"box": SeenObject(make_pose(np.array([1.0, 0, 1]), UNIT))}, 2.0)
+    assert eyes.sees("box")
+    show(eyes, behind, 2.5)  # what was before them has arrived by now
+    last = eyes.pose("box").copy()
+    show(eyes, behind, 3.0)
+    assert not eyes.sees("box")
+    np.testing.assert_array_equal(eyes.pose("box"), last)
+
+
+def test_errors_grow_with_distance_but_not_between_neighbours() -> None:
+    def look(distance: float, seed: int) -> np.ndarray:
+        eyes = Perception(Person(), np.random.default_rng(seed))
+        objects = {
+            name: SeenObject(make_pose(np.array([distance, y, 1.0]), UNIT))
+            for name, y in (("a", 0.0), ("b", 0.05))
+        }
+        show(eyes, objects, 1.0)
+        truth = np.array([objects[name].pose[:3] for name in ("a", "b")])
+        return np.array([eyes.pose(name)[:3] for name in ("a", "b")]) - truth
+
+    near = np.array([look(0.5, seed) for seed in range(40)])
+    far = np.array([look(2.0, seed) for seed in range(40)])
+    rms = lambda errors: float(np.sqrt((errors**2).sum(-1).mean()))  # noqa: E731
+    assert rms(far) > 2.5 * rms(near)
+    assert rms(near[:, 0] - near[:, 1]) < rms(near[:, 0])
+
+
+def test_gives_up_and_is_finished() -> None:
+    world, device = ToyWorld(make_points(), deaf=100), make_person(0)
+    run_touch(world, device)
+    assert device.mind.diary[-1][1] == "gave up: could not change to mobile"
+    assert device.is_finished(world.time)
+    assert world.mode is Mode.STATIONARY
+
+
+def test_unknown_task_is_named() -> None:
+    device = make_person()
+    with pytest.raises(UnknownName, match="unknown task of the simulated operator 'juggle'"):
+        device.see(View(0.0, "juggle", make_body()))
+
+
+def test_needs_something_to_see() -> None:
+    device = make_person()
+    device.start(0.0)
+    with pytest.raises(BadValue, match="'simulated' sees nothing to do: it needs a robot with a"):
+        device.read(0.04)
+
+
+def test_after_a_reset_the_same_person_tries_again_with_other_chance() -> None:
+    world, device = ToyWorld(make_points()), make_person(4)
+    for _ in range(100):
+        world.step(device)
+    person, last = device.mind.person, device.mind
+    device.start(world.time)
+    assert device.mind is not last
+    assert device.mind.person == person
+    assert device.mind.rng.random() != last.rng.random()
