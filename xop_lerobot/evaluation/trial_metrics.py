@@ -20,7 +20,6 @@ from xop_lerobot.evaluation.metrics import (
 )
 from xop_lerobot.evaluation.trial import Trace, Trial
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
-from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.state import FRAMES
 
 TOUCH = 0.05
@@ -141,14 +140,16 @@ def _compute_palm_metrics(trace: Trace, dt: float) -> dict[str, float]:
 
 
 def _compute_slip(morphology: Morphology, trace: Trace, dt: float) -> float:
-    groups = morphology.contact_groups
-    points = tuple(point for group in groups for point in group)
-    kinematics = SiteKinematics(morphology.build_spec("planning").compile(), points)
-    feet = []
-    for qpos in trace.qpos:
-        poses = kinematics.compute_poses(qpos)
-        feet.append([np.mean([poses[point][:3] for point in group], axis=0) for group in groups])
-    return compute_slip(np.array(feet), dt)
+    model = morphology.build_spec("planning").compile()
+    data = mujoco.MjData(model)
+    groups = [[model.site(name).id for name in group] for group in morphology.contact_groups]
+    feet = np.empty((len(trace.time), len(groups), 3))
+    for row, qpos in enumerate(trace.qpos):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        for column, sites in enumerate(groups):
+            feet[row, column] = data.site_xpos[sites].mean(axis=0)
+    return compute_slip(feet, dt)
 
 
 def _compute_touch(trace: Trace, dt: float) -> float:
