@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from xop_lerobot.command import Mode
@@ -10,9 +12,9 @@ from xop_lerobot.operator.simulated.body import SIDES
 from xop_lerobot.operator.simulated.hands import (
     compute_distance,
     compute_errors,
-    compute_pointing,
     compute_wrist,
     look_at_work,
+    move_hands,
     nudge,
     plan_posture,
     reach,
@@ -30,23 +32,35 @@ from xop_lerobot.transforms import (
     wrap_angle,
 )
 
-BESIDE = 0.08
+BESIDE = 0.06
 """Palms come so far beside the box before they close [m]."""
 WRIST_CLEAR = 0.025
 """Wrists stay so far before the box's near edge [m]."""
-PRESS = 0.07
-"""Hands that press go so far beyond where they were stopped [m]."""
-PRESS_MORE = 0.03
+FARTHEST = 0.05
+"""Palms that are not stopped end so far inside of the box's sides [m]."""
+CLOSE_SPEED = 0.06
+"""Mean speed of closing hands [m/s]."""
+BEHIND = 0.015
+"""A palm that far behind the own hand is stopped [m]."""
+ROBOT_LAG = 0.1
+"""How much later than oneself a robot is known to move [s]."""
+PRESS = 0.03
+"""Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
+SEEN_LATE = 0.025
+"""How much of that is done by the time that a stopped hand is seen [m]."""
+PRESS_MORE = 0.02
 """How much more they press after a box has slipped [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""
-LIFT = 0.12
+LIFT = 0.10
 """How high the box is lifted [m]."""
 LIFTED = 0.05
 """Rise from which the person is sure to have lifted it [m]."""
 HOLD_S = 3.6
 """How long the lifted box is held [s]."""
-CARRY_SPEED = 0.12
+BESIDE_TOLERANCE = 0.02
+"""How far beside their places the palms may be before they close [m]."""
+CARRY_SPEED = 0.09
 """Mean speed of hands that hold something [m/s]."""
 BACK = 0.35
 """How far the person steps back from the support [m]."""
@@ -115,32 +129,30 @@ def compute_sides(mind: Mind, outside: float, before: float = 0.0) -> dict[str, 
     left = np.array([-ahead[1], ahead[0], 0])
     wrist = mind.feel("left_wrist")[:3] - mind.feel("left_palm")[:3]
     hand = float(np.linalg.norm(wrist))
-    middle = mind.eyes.pose("box")[:3] + (hand - half[0] - WRIST_CLEAR - before) * ahead
-    across = (half[1] + outside) * left
+    forward = mind.eyes.recall("palm_forward", hand - half[0] - WRIST_CLEAR)
+    middle = mind.eyes.pose("box")[:3] + (forward - before) * ahead
+    across = (half[1] + mind.eyes.recall("palm_outside", 0.0) + outside) * left
     return {"left": middle + across, "right": middle - across}
 
 
-def compute_flat(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
-    """Hand on the forearm, but its palm flat against a side of the box. Shape (4,)."""
+def compute_flat(mind: Mind, side: str) -> np.ndarray:
+    """Hand level along the box, its palm flat against a side. Shape (4,)."""
     heading = compute_heading(mind.eyes.pose("head")[3:])
     yaw = float(quat_yaw(mind.eyes.pose("box")[3:]))
-    heading = yaw + np.pi / 2 * np.round((heading - yaw) / (np.pi / 2))
-    ahead = compute_ahead(float(heading))
+    ahead = compute_ahead(float(yaw + np.pi / 2 * np.round((heading - yaw) / (np.pi / 2))))
     outwards = np.array([-ahead[1], ahead[0], 0]) * (1 if side == "left" else -1)
-    forearm = quat_rotate(compute_pointing(mind, side, point), np.array([1.0, 0, 0]))
-    forearm = forearm - (forearm @ outwards) * outwards
-    forearm /= np.linalg.norm(forearm)
-    return quat_from_matrix(np.column_stack([forearm, np.cross(outwards, forearm), outwards]))
+    return quat_from_matrix(np.column_stack([ahead, np.cross(outwards, ahead), outwards]))
 
 
 def pick_up(mind: Mind) -> Doing:
     """Take hold of the box and lift it; who fails presses harder."""
     box = mind.eyes.pose("box")[:3]
     yield from take_posture(mind, plan_posture(mind, [box]))
+    press = mind.eyes.recall("press", PRESS)
     for attempt in range(GRASPS):
         yield from bring_beside(mind)
         rest = float(mind.eyes.pose("box")[2])
-        yield from close(mind, PRESS + attempt * PRESS_MORE)
+        yield from close(mind, max(press - SEEN_LATE, 0.0) + attempt * PRESS_MORE)
         mind.note("lift")
         yield from shift_hands(mind, np.array([0, 0, LIFT]), CARRY_SPEED)
         yield from mind.settle()
@@ -160,7 +172,7 @@ def bring_beside(mind: Mind) -> Doing:
         sides = compute_sides(mind, BESIDE + (0.03 if before else 0.0), before)
         wrists = {}
         for side, point in sides.items():
-            quat = compute_flat(mind, side, point)
+            quat = compute_flat(mind, side)
             wrists[side] = compute_wrist(mind, side, point, quat)
         mind.note("hands beside the box" if not before else "hands before the box")
         yield from reach(mind, wrists)
@@ -171,7 +183,7 @@ def bring_beside(mind: Mind) -> Doing:
             errors = compute_errors(mind, sides)
             worst = max(float(np.linalg.norm(error)) for error in errors.values())
             mind.note(f"palms {100 * worst:.1f} cm off")
-            if worst <= mind.person.hand_tolerance or before:
+            if worst <= BESIDE_TOLERANCE or before:
                 break
             yield from nudge(mind, errors)
 
@@ -179,23 +191,65 @@ def bring_beside(mind: Mind) -> Doing:
 def close(mind: Mind, press: float) -> Doing:
     """Close the hands on the box until they are stopped, then press.
 
-    Nobody feels what the robot touches; that the hands are stopped is seen.
+    Nobody feels what the robot touches: a hand is stopped when it is seen to fall behind the own
+    one. A hand that is stopped waits for the other.
     """
-    body = mind.body
-    goals = compute_sides(mind, -press)
-    room = body.compute_hands_in_room()
-    left = mind.belief.vector_to_own(goals["left"] - goals["right"])
-    inwards = -left / np.linalg.norm(left)
-    gap = {side: mind.feel(f"{side}_palm")[:3] - goals[side] for side in SIDES}
-    ends = {}
-    for i, side in enumerate(SIDES):
-        sign = 1.0 if side == "left" else -1.0
-        way = abs(float(mind.belief.vector_to_own(gap[side]) @ left)) / np.linalg.norm(left)
-        ends[side] = make_pose(room[i][:3] + sign * way * inwards, room[i][3:])
-    mind.note(f"squeeze by {100 * press:.0f} cm")
-    end = body.with_hands_in_room(body.posture, ends)
-    body.move(end, 1.6)
+    goals = compute_sides(mind, -FARTHEST)
+    across = (goals["left"] - goals["right"]) / np.linalg.norm(goals["left"] - goals["right"])
+    inwards = {"left": -across, "right": across}
+    own = {side: mind.belief.vector_to_own(way) for side, way in inwards.items()}
+    start = {side: mind.feel(f"{side}_palm")[:3] for side in SIDES}
+    ways = {s: float((goals[s] - start[s]) @ inwards[s]) for s in SIDES}
+    first = mind.body.compute_hands_in_room()
+    closing, trail = set(SIDES), deque([(mind.time, first)])
+    mind.note("close the hands")
+    while closing:
+        room = mind.body.compute_hands_in_room()
+        ends = {}
+        for side in closing:
+            i = SIDES.index(side)
+            end = first[i][:3] + max(ways[side], 0.0) * own[side]
+            ends[side] = make_pose(end, room[i][3:])
+        longest = max(
+            float(np.linalg.norm(e[:3] - room[SIDES.index(s)][:3])) for s, e in ends.items()
+        )
+        mind.body.move(mind.body.with_hands_in_room(mind.body.posture, ends), longest / CLOSE_SPEED)
+        while mind.body.is_moving:
+            yield
+            trail.append((mind.time, mind.body.compute_hands_in_room()))
+            while trail[0][0] < mind.time - mind.person.delay - ROBOT_LAG:
+                trail.popleft()
+            stopped = {
+                s for s in closing if _is_stopped(mind, s, start[s], trail[0][1], first, inwards[s])
+            }
+            if stopped:
+                closing -= stopped
+                break
+        else:
+            break
+    mind.note(f"press by {100 * press:.0f} cm")
+    room = mind.body.compute_hands_in_room()
+    ends = {
+        side: make_pose(room[i][:3] + press * own[side], room[i][3:])
+        for i, side in enumerate(SIDES)
+    }
+    yield from move_hands(mind, ends, slowness=2.0)
     yield from mind.settle("left_palm", "right_palm")
+
+
+def _is_stopped(
+    mind: Mind,
+    side: str,
+    start: np.ndarray,
+    own: np.ndarray,
+    first: np.ndarray,
+    inwards: np.ndarray,
+) -> bool:
+    """Whether a palm is behind the own hand of the moment that is seen now."""
+    i = SIDES.index(side)
+    went = mind.belief.scale * float(np.linalg.norm(own[i][:3] - first[i][:3]))
+    came = float((mind.feel(f"{side}_palm")[:3] - start) @ inwards)
+    return went - came > BEHIND
 
 
 def open_hands(mind: Mind) -> Doing:

@@ -101,6 +101,10 @@ class Perception:
         """Whether the robot has fallen."""
         return self._view.fallen
 
+    def recall(self, name: str, default: float) -> float:
+        """What a person who has practised the task knows, by name [m]."""
+        return float(self._view.hints.get(name, default))
+
     def knows(self, name: str) -> bool:
         """Whether the thing was ever seen."""
         return name in self._seen
