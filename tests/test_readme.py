@@ -102,6 +102,14 @@ def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.Monk
     if command[0] == "xop-bench":
         parse_bench(command[1:])
         return
+    if command[0] == "xop-eval":
+        from xop_lerobot.evaluation import study
+        from xop_lerobot.evaluation.eval_cli import make_study, parse_arguments
+
+        monkeypatch.chdir(ROOT)
+        monkeypatch.setattr(study, "_find_absence", lambda *_: "")
+        assert make_study(parse_arguments(command[1:]))
+        return
     config = parse(command, monkeypatch)
     dataset = getattr(config, "dataset", None)
     if dataset is not None and hasattr(config, "robot") and hasattr(dataset, "num_episodes"):
