@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from xop_lerobot.operator.simulated.body import SIDES, Posture
+from xop_lerobot.operator.simulated.body import NECK, SIDES, Posture
 from xop_lerobot.operator.simulated.mind import Doing, Mind
 from xop_lerobot.transforms import (
     make_pose,
@@ -54,14 +54,18 @@ def plan_posture(mind: Mind, points: list[np.ndarray]) -> Posture:
     Within a comfortable range below the eyes a person stands upright; for what is lower the
     person squats, and nods to see it.
     """
-    person, belief, body = mind.person, mind.belief, mind.body
-    standing = person.eye_height
+    look = np.array([0.0, compute_nod(mind, points)])
     drop = compute_drop(mind, points)
-    lowest = standing - drop - belief.height_to_own(float(min(p[2] for p in points)))
-    nod = np.arctan2(lowest, person.reach * person.size)
-    nod -= person.view_half_angles[1] - MARGIN
-    look = np.array([0.0, float(np.clip(nod, 0.0, LARGEST_NOD))])
-    return replace(body.posture, drop=drop, lean=np.zeros(2), look=look)
+    return replace(mind.body.posture, drop=drop, lean=np.zeros(2), look=look)
+
+
+def compute_nod(mind: Mind, points: list[np.ndarray]) -> float:
+    """Nod with which points are well in view, from where they are worked at best [rad]."""
+    eyes = mind.person.eye_height - compute_drop(mind, points)
+    lowest = eyes - mind.belief.height_to_own(float(min(point[2] for point in points)))
+    angle = np.arctan2(mind.belief.scale * lowest, compute_reach(mind))
+    nod = angle - mind.person.view_half_angles[1] + MARGIN
+    return float(np.clip(nod, 0.0, LARGEST_NOD))
 
 
 def compute_drop(mind: Mind, points: list[np.ndarray]) -> float:
@@ -71,14 +75,22 @@ def compute_drop(mind: Mind, points: list[np.ndarray]) -> float:
     return float(np.clip(below - person.reach_low * person.size, 0.0, person.leg_bend))
 
 
-def compute_distance(mind: Mind, points: list[np.ndarray]) -> float:
-    """How far ahead of the head points are worked at best, in the robot's world [m].
+def compute_reach(mind: Mind) -> float:
+    """How far ahead of the robot's head hands work at best [m].
 
-    Who squats has the knees ahead, and works farther out.
+    It is half way from where the own hands would work to where the robot's hands are at rest.
     """
-    person = mind.person
-    own = person.reach * person.size + KNEES * compute_drop(mind, points)
-    return mind.belief.scale * own
+    own = mind.person.reach * mind.person.size
+    return (mind.belief.scale * own + mind.eyes.rest_reach) / 2
+
+
+def compute_distance(mind: Mind, points: list[np.ndarray]) -> float:
+    """From where to stand upright to what hands shall work at, in the robot's world [m].
+
+    Who nods brings the eyes forward; who squats has the knees ahead, and works farther out.
+    """
+    knees = mind.belief.scale * KNEES * compute_drop(mind, points)
+    return compute_reach(mind) + knees + NECK * float(np.sin(compute_nod(mind, points)))
 
 
 def is_stretched(mind: Mind, side: str, point: np.ndarray) -> bool:

@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 
 from xop_lerobot.command import Mode
+from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.person import Person
 from xop_lerobot.operator.view import SeenObject, View
 from xop_lerobot.transforms import make_pose, quat_conjugate, quat_exp, quat_multiply, quat_rotate
@@ -57,9 +58,12 @@ class Perception:
         self._trail: deque[View] = deque()
         self._seen: dict[str, SeenObject] = {}
         self._in_view: set[str] = set()
+        self._rest_reach = 0.0
 
     def show(self, view: View) -> None:
         """Take what the robot's cameras see now; the person knows of it later."""
+        if not self._queue and self.is_blind:
+            self._rest_reach = _measure_reach(view)
         self._queue.append(view)
 
     def advance(self, time: float) -> None:
@@ -120,6 +124,14 @@ class Perception:
     def size(self, name: str) -> np.ndarray:
         """Half the extents of the thing [m]. Shape (3,)."""
         return self._seen[name].size
+
+    @property
+    def rest_reach(self) -> float:
+        """How far ahead of its head the robot holds its palms, as it waits for a person [m].
+
+        People look the robot over before they put the headset on.
+        """
+        return self._rest_reach
 
     @property
     def names(self) -> list[str]:
@@ -196,3 +208,12 @@ class Perception:
                     make_pose(last.pose[:3] + share * step, thing.pose[3:]), thing.size
                 )
         self._seen[name] = thing
+
+
+def _measure_reach(view: View) -> float:
+    """From the head to the middle of the palms, along the head's heading [m]."""
+    head = view.frames["head"]
+    palms = [pose[:3] for name, pose in view.frames.items() if name.endswith("_palm")]
+    way = np.mean(palms, axis=0) - head[:3]
+    heading = compute_heading(head[3:])
+    return float(way[0] * np.cos(heading) + way[1] * np.sin(heading))

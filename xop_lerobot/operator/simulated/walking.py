@@ -10,7 +10,7 @@ from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.body import Posture, relaxed_hands
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.transforms import wrap_angle
+from xop_lerobot.transforms import quat_to_rpy, wrap_angle
 
 LAG = 0.4
 """How long a person still looks when the own turn is over: the robot may be behind [s]."""
@@ -22,6 +22,8 @@ MODE_TRIES = 6
 """How often a person tries a double pinch before giving up."""
 STUCK_FROM, STUCK, MOST_STUCK = 0.25, 0.75, 3
 """A leg of that length [m], of which so much is left, was in vain; as often as a person tries."""
+STRAIN = (0.06, 0.2)
+"""Difference of height [m] and of tilt [rad] to the own head from which a robot strains."""
 TURN_FIRST = 0.35
 """Angle up to which a person sets out without turning first [rad]."""
 
@@ -109,11 +111,20 @@ def go_to(
         target[2] += float(mind.scatter(abs(turn), 1)[0])
         yield from _walk(mind, target, hands, straight=leg % 3 == 2)  # noqa: PLR2004
         yield from mind.settle(patience=2.5)
-        if miss > STUCK_FROM and compute_miss(mind, place)[0] > STUCK * miss:
+        in_vain = miss > STUCK_FROM and compute_miss(mind, place)[0] > STUCK * miss
+        if in_vain or is_strained(mind):
             yield from _come_back(mind, own, seen)
             stuck += 1
             if stuck >= MOST_STUCK:
                 return
+
+
+def is_strained(mind: Mind) -> bool:
+    """Whether the robot bends or stretches after a head that it cannot follow."""
+    seen, own = mind.eyes.pose("head"), mind.body.compute_head()
+    lift = abs(float(seen[2]) - mind.belief.scale * float(own[2]))
+    tilt = np.abs(quat_to_rpy(seen[3:])[:2] - quat_to_rpy(own[3:])[:2])
+    return bool(lift > STRAIN[0] or tilt.max() > STRAIN[1])
 
 
 def _come_back(mind: Mind, own: np.ndarray, seen: np.ndarray) -> Doing:
