@@ -102,6 +102,11 @@ def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.Monk
     if command[0] == "xop-bench":
         parse_bench(command[1:])
         return
+    if command[0] == "xop-collect":
+        from xop_lerobot.dataset.collect import parse_arguments as parse_collect
+
+        parse_collect(command[1:])[0].check()
+        return
     if command[0] == "xop-eval":
         from xop_lerobot.evaluation import study
         from xop_lerobot.evaluation.eval_cli import make_study, parse_arguments

@@ -1,0 +1,101 @@
+"""Put single episodes together to one dataset, in the order of their indices."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets import dataset_metadata
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.utils import EPISODES_DIR
+
+from xop_lerobot.dataset.collect_folder import COLLECT_FILE, CollectFolder, write_whole
+from xop_lerobot.dataset.facts import CONFIG_FILE, EPISODES_FILE, FACTS_DIR, read_facts
+
+
+def merge_attempts(
+    folder: CollectFolder,
+    count: int,
+    repo_id: str,
+    settings: Mapping[str, Any],
+    note_walls: Callable[[], Mapping[str, float]],
+) -> None:
+    """Merge the dataset that is there, if any, and finished episodes into a new one.
+
+    As when they are recorded one after another, each episode has files of its own, and its facts
+    are in `meta/xop/episodes.jsonl`. Nothing of what was there is changed before the new dataset
+    is whole; then one takes the other's place. Without a single episode to keep, nothing happens.
+
+    Args:
+        folder: The collection's files.
+        count: Episodes with an index below this are merged, the others stay for another time.
+        repo_id: Name of the dataset.
+        settings: What was collected.
+        note_walls: Tells how long each run took so far [s], by its start.
+    """
+    attempts = [each for index, each in folder.read_attempts().items() if index < count]
+    before = folder.read_dataset()
+    sources = [folder.root] if before else []
+    sources += [folder.get_dataset(attempt.index) for attempt in attempts if attempt.kept]
+    if not sources:
+        return
+    merged = folder.merged
+    shutil.rmtree(merged, ignore_errors=True)
+    with _read_episodes_fast():
+        aggregate_datasets(
+            [repo_id] * len(sources),
+            repo_id,
+            roots=sources,
+            aggr_root=merged,
+            concatenate_videos=False,
+            concatenate_data=False,
+        )
+    _merge_facts(sources, merged)
+    rows = [*before.get("attempts", ()), *map(dataclasses.asdict, attempts)]
+    document = {"settings": settings, "walls": note_walls(), "attempts": rows}
+    write_whole(merged / COLLECT_FILE, document)
+    folder.exchange(attempt.index for attempt in attempts)
+
+
+def _merge_facts(sources: Sequence[Path], merged: Path) -> None:
+    """Take the facts on the episodes along; LeRobot merges only what is its own."""
+    (merged / FACTS_DIR).mkdir(parents=True, exist_ok=True)
+    shutil.copy(sources[-1] / CONFIG_FILE, merged / CONFIG_FILE)
+    rows = [row for source in sources for row in read_facts(source)]
+    with (merged / EPISODES_FILE).open("w", encoding="utf-8") as file:
+        for index, row in enumerate(rows):
+            file.write(json.dumps({**row, "episode_index": index}) + "\n")
+
+
+@contextmanager
+def _read_episodes_fast() -> Iterator[None]:
+    """In the block, let LeRobot read the episodes' metadata without `datasets`.
+
+    That library takes a second for the 900 columns of a single episode. Without its name in
+    LeRobot's module, nothing is replaced.
+    """
+    stock = getattr(dataset_metadata, "load_episodes", None)
+    if stock is None:
+        yield
+        return
+    dataset_metadata.load_episodes = _load_episodes  # pyright: ignore
+    try:
+        yield
+    finally:
+        dataset_metadata.load_episodes = stock  # pyright: ignore
+
+
+def _load_episodes(root: Path) -> dict[str, list]:
+    """Read the columns of a dataset's episode metadata, but for the statistics."""
+    tables = []
+    for path in sorted((root / EPISODES_DIR).glob("*/*.parquet")):
+        names = [name for name in pq.read_schema(path).names if not name.startswith("stats/")]
+        tables.append(pq.read_table(path, columns=names))
+    return pa.concat_tables(tables).to_pydict()
