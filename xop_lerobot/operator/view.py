@@ -37,6 +37,7 @@ class View:
         engaged: Whether the operator drives, as the display shows it.
         fallen: Whether the robot has fallen.
         success: Whether the task is accomplished.
+        hints: What a person who has practised the task knows, by name (docs/tasks.md) [m].
     """
 
     time: float
@@ -47,3 +48,4 @@ class View:
     engaged: bool = False
     fallen: bool = False
     success: bool = False
+    hints: Mapping[str, float] = field(default_factory=dict)

@@ -7,7 +7,7 @@ from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.simulated.intentions import INTENTIONS
+from xop_lerobot.operator.simulated.intentions import INTENTIONS, PREPARATIONS
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
 from xop_lerobot.operator.view import View
 
@@ -62,6 +62,8 @@ class SimulatedDevice(Device):
             raise UnknownName("task of the simulated operator", view.task, INTENTIONS)
         self._task = view.task
         self.mind.see(view)
+        if self._started_at is None and view.task in PREPARATIONS:
+            PREPARATIONS[view.task](self.mind)
 
     def read(self, time: float) -> OperatorFrame:
         """Go on to `time` [s] of the robot's clock and return the frame of that instant.

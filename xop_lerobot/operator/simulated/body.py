@@ -116,6 +116,10 @@ class Body:
         """Whether a double pinch is under way."""
         return any(self.time < at + DOUBLE_PINCH_S for at in self._pinched_at.values())
 
+    def hold(self, hands: np.ndarray) -> None:
+        """Hold the hands so, before anybody looks. Shape (2, 7)."""
+        self.posture = self._start = self._end = replace(self.posture, hands=hands)
+
     def move(self, end: Posture, duration: float) -> None:
         """Begin to go to `end` with minimum jerk, in `duration` [s]."""
         self._begin(end, duration, 0.0)

@@ -38,18 +38,22 @@ WRIST_CLEAR = 0.025
 """Wrists stay so far before the box's near edge [m]."""
 FARTHEST = 0.05
 """Palms that are not stopped end so far inside of the box's sides [m]."""
-CLOSE_SPEED = 0.06
+CLOSE_SPEED = 0.045
 """Mean speed of closing hands [m/s]."""
 BEHIND = 0.015
 """A palm that far behind the own hand is stopped [m]."""
-ROBOT_LAG = 0.1
+ROBOT_LAG = 0.35
 """How much later than oneself a robot is known to move [s]."""
 PRESS = 0.03
 """Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
-SEEN_LATE = 0.025
+SEEN_LATE = 0.04
 """How much of that is done by the time that a stopped hand is seen [m]."""
 PRESS_MORE = 0.02
 """How much more they press after a box has slipped [m]."""
+APPROACHES = 4
+"""How often a person walks up to the box before giving up."""
+OUT_OF_REACH = 0.06
+"""Palms that stay so far beside their places are out of reach [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""
 LIFT = 0.10
@@ -68,11 +72,22 @@ PLACE_NEAR = 0.03
 """How far beside the spot the box may be put down [m]."""
 
 
+class OutOfReach(Exception):
+    """The hands do not come to where they should be; the person has to stand elsewhere."""
+
+
 def carry_box(mind: Mind) -> Doing:
     """Take the box from its support to the spot on the table."""
     yield from find(mind, "box")
-    yield from walk_to_box(mind)
-    yield from pick_up(mind)
+    for _ in range(APPROACHES):
+        yield from walk_to_box(mind)
+        try:
+            yield from pick_up(mind)
+            break
+        except OutOfReach:
+            mind.note("the hands do not get there")
+    else:
+        raise GaveUp("does not get hold of the box")
     yield from walk_to_table(mind)
     yield from put_down(mind)
 
@@ -186,6 +201,8 @@ def bring_beside(mind: Mind) -> Doing:
             if worst <= BESIDE_TOLERANCE or before:
                 break
             yield from nudge(mind, errors)
+        if worst > OUT_OF_REACH and not before:
+            raise OutOfReach
 
 
 def close(mind: Mind, press: float) -> Doing:

@@ -10,7 +10,16 @@ from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.person import Person
 from xop_lerobot.operator.view import SeenObject, View
-from xop_lerobot.transforms import make_pose, quat_conjugate, quat_exp, quat_multiply, quat_rotate
+from xop_lerobot.transforms import (
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_conjugate,
+    quat_exp,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+)
 
 WINDOW = 0.4
 """Time over which a person judges whether something moves [s]."""
@@ -59,11 +68,13 @@ class Perception:
         self._seen: dict[str, SeenObject] = {}
         self._in_view: set[str] = set()
         self._rest_reach = 0.0
+        self._first_look: np.ndarray | None = None
 
     def show(self, view: View) -> None:
         """Take what the robot's cameras see now; the person knows of it later."""
         if not self._queue and self.is_blind:
             self._rest_reach = _measure_reach(view)
+            self._first_look = _measure_hand(view)
         self._queue.append(view)
 
     def advance(self, time: float) -> None:
@@ -132,6 +143,11 @@ class Perception:
         People look the robot over before they put the headset on.
         """
         return self._rest_reach
+
+    @property
+    def first_look(self) -> np.ndarray | None:
+        """The robot's left wrist from its head, lengths over its head's height. Shape (7,)."""
+        return self._first_look
 
     @property
     def names(self) -> list[str]:
@@ -217,3 +233,11 @@ def _measure_reach(view: View) -> float:
     way = np.mean(palms, axis=0) - head[:3]
     heading = compute_heading(head[3:])
     return float(way[0] * np.cos(heading) + way[1] * np.sin(heading))
+
+
+def _measure_hand(view: View) -> np.ndarray:
+    """Left wrist from the head along its heading, over the head's height. Shape (7,)."""
+    head = view.frames["head"]
+    level = make_pose(head[:3], quat_from_yaw(compute_heading(head[3:])))
+    wrist = pose_multiply(pose_inverse(level), view.frames["left_wrist"])
+    return make_pose(wrist[:3] / head[2], wrist[3:])

@@ -1,0 +1,162 @@
+"""How a person moves, in figures: the same of recorded people and of the simulated one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.noise import HumanNoise
+from xop_lerobot.operator.recording import load_recording
+from xop_lerobot.operator.simulated.body import SIDES, Body
+from xop_lerobot.operator.simulated.hands import compute_reach_time
+from xop_lerobot.operator.simulated.mind import Mind
+from xop_lerobot.transforms import quat_conjugate, quat_log, quat_multiply
+
+RATE = 60.0
+"""Rate at which motions are compared [Hz]."""
+SMOOTH_S = 0.1
+"""Window over which positions are averaged before they are differentiated [s]."""
+STILL = 0.15
+"""Speed of the head below which a person stands [m/s]."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of one person, evenly sampled.
+
+    Attributes:
+        name: Whose it is.
+        simulated: Whether the person is simulated.
+        time: Time [s]. Shape (n,).
+        head: Position of the head [m]. Shape (n, 3).
+        turns: Angular speed of the head [rad/s]. Shape (n,).
+        hands: Wrists from the head, axes of the room [m]. Shape (2, n, 3).
+    """
+
+    name: str
+    simulated: bool
+    time: np.ndarray
+    head: np.ndarray
+    turns: np.ndarray
+    hands: np.ndarray
+
+    @property
+    def speeds(self) -> Mapping[str, np.ndarray]:
+        """Speed of the head, and of the hands in the room [m/s]. Shapes (n,)."""
+        named = {"head": self.head}
+        for side, hand in zip(SIDES, self.hands, strict=True):
+            named[f"{side} hand"] = self.head + hand
+        return {name: np.linalg.norm(_differentiate(way), axis=1) for name, way in named.items()}
+
+
+def load_motion(path: Path) -> Motion:
+    """Load a recording.
+
+    Raises:
+        BadRecording: If it is missing or malformed.
+    """
+    recording = load_recording(path)
+    stamps = np.arange(0, recording.duration, 1 / RATE)
+    return _make_motion(path.stem, [recording.frame_at(stamp) for stamp in stamps], simulated=False)
+
+
+def simulate_motion(seed: int, duration: float = 30.0) -> Motion:
+    """A simulated person who stands, walks, turns and reaches by chance, alone in the room."""
+    mind = Mind(seed)
+    body, rng = mind.body, np.random.default_rng((seed, 9))
+    frames, resting = [], 0.0
+    for time in np.arange(0, duration, 1 / RATE):
+        body.advance(float(time))
+        if not body.is_moving and time >= resting:
+            _move_by_chance(mind, body, rng)
+            resting = time + float(rng.uniform(0.3, 3.0))
+        frames.append(body.make_frame(float(time)))
+    return _make_motion(f"simulated {seed}", frames, simulated=True)
+
+
+def _move_by_chance(mind: Mind, body: Body, rng: np.random.Generator) -> None:
+    """Begin to walk a step or two, or to reach for something."""
+    posture = body.posture
+    if rng.random() < 0.5:  # noqa: PLR2004
+        from dataclasses import replace  # noqa: PLC0415
+
+        step = np.array([*rng.uniform(-1.2, 1.2, 2), rng.uniform(-1.5, 1.5)])
+        body.walk(replace(posture, place=posture.place + step))
+        return
+    room = body.compute_hands_in_room()
+    side = int(rng.integers(2))
+    way = rng.uniform(-0.25, 0.25, 3)
+    goal = room[side].copy()
+    goal[:3] += way
+    duration = compute_reach_time(mind, float(np.linalg.norm(way)))
+    body.move(body.with_hands_in_room(posture, {SIDES[side]: goal}), duration)
+
+
+def compute_figures(motion: Motion) -> dict[str, float]:
+    """Medians, 95th percentiles and jerks of head and hands, by name with the unit."""
+    speeds = motion.speeds
+    hands = np.concatenate([speeds[f"{side} hand"] for side in SIDES])
+    reach = np.concatenate([np.linalg.norm(_differentiate(hand), axis=1) for hand in motion.hands])
+    return {
+        "length [s]": float(motion.time[-1]),
+        "head median [m/s]": float(np.median(speeds["head"])),
+        "head 95 % [m/s]": float(np.percentile(speeds["head"], 95)),
+        "head turn 95 % [rad/s]": float(np.percentile(motion.turns, 95)),
+        "hand median [m/s]": float(np.median(hands)),
+        "hand 95 % [m/s]": float(np.percentile(hands, 95)),
+        "hand against head 95 % [m/s]": float(np.percentile(reach, 95)),
+        "head jerk RMS [m/s³]": _compute_jerk(motion.head),
+        "hand jerk RMS [m/s³]": _compute_jerk(motion.head + motion.hands[0]),
+    }
+
+
+def compute_spectrum(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Power of the head's velocity over frequency, all three axes together.
+
+    Returns:
+        Frequencies [Hz], and power [m²/s²/Hz]. Shapes (k,).
+    """
+    velocity = np.gradient(motion.head, 1 / RATE, axis=0)
+    window = np.hanning(len(velocity))[:, None]
+    power = (np.abs(np.fft.rfft(velocity * window, axis=0)) ** 2).sum(axis=1)
+    frequency = np.fft.rfftfreq(len(velocity), 1 / RATE)
+    return frequency[1:], 2 * power[1:] / (RATE * float((window**2).sum()))
+
+
+def compute_standing_sway(seed: int, duration: float = 60.0) -> np.ndarray:
+    """RMS of the head's sway forward, sideways and up while standing [m]. Shape (3,)."""
+    noise = HumanNoise(seed)
+    heads = np.array([noise.at(t).head for t in np.arange(0, duration, 1 / RATE)])
+    return heads.std(axis=0)
+
+
+def _make_motion(name: str, frames: list[OperatorFrame], *, simulated: bool) -> Motion:
+    head = np.array([frame.head for frame in frames])
+    turn = quat_log(quat_multiply(quat_conjugate(head[:-1, 3:]), head[1:, 3:])) * RATE
+    turns = np.linalg.norm(_smooth(np.vstack([turn, turn[-1:]])), axis=1)
+    wrists = np.array([[f.left_wrist[:3], f.right_wrist[:3]] for f in frames]).swapaxes(0, 1)
+    return Motion(
+        name, simulated, np.arange(len(frames)) / RATE, head[:, :3], turns, wrists - head[:, :3]
+    )
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Moving average over `SMOOTH_S`; the ends are held. Shape (n, ...)."""
+    size = max(1, round(SMOOTH_S * RATE)) | 1
+    padded = np.pad(values, ((size // 2, size // 2), (0, 0)), mode="edge")
+    kernel = np.ones(size) / size
+    return np.stack([np.convolve(column, kernel, "valid") for column in padded.T], axis=1)
+
+
+def _differentiate(values: np.ndarray) -> np.ndarray:
+    return np.gradient(_smooth(values), 1 / RATE, axis=0)
+
+
+def _compute_jerk(way: np.ndarray) -> float:
+    """RMS of the third derivative of a smoothed way [m/s³]."""
+    jerk = np.diff(_smooth(_smooth(way)), n=3, axis=0) * RATE**3
+    return float(np.sqrt((jerk**2).sum(axis=1).mean()))

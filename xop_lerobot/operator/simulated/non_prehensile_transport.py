@@ -1,0 +1,191 @@
+"""Carry a toy on the open left palm over the obstacles, and tip it into the opening."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
+from xop_lerobot.operator.simulated.walking import compute_miss, find, go_to, set_mode
+from xop_lerobot.transforms import (
+    make_pose,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    quat_yaw,
+    wrap_angle,
+)
+
+CLEAR = 0.10
+"""The palm passes so far over the tops of the obstacles [m]."""
+OVER_RIM = 0.08
+"""The palm tips so far over the rim [m]."""
+EDGE = 0.04
+"""From the middle of a palm to its edge, for who does not know the hand [m]."""
+BEYOND_EDGE = 0.015
+"""The toy falls so far beyond the edge of the palm [m]."""
+FREE = 0.12
+"""The hand starts so far to the left of the first obstacle [m]."""
+CARRY_SPEED = 0.10
+"""Mean speed of a hand on which something lies loose [m/s]."""
+AIM = (0.008, 0.02)
+"""How well the toy is aimed: along the hand, and across [m]."""
+TIP = 1.3
+"""Roll that tips the palm [rad]."""
+TIP_S = 1.2
+"""Time of the roll [s]."""
+TILTED = 0.5
+"""Tilt from which the palm is seen to have tipped [rad]."""
+WAIT_S = 2.5
+"""How long the person holds still at first, until the toy lies on the palm [s]."""
+
+
+def carry_toy(mind: Mind) -> Doing:
+    """Take the toy on the palm to the container and tip it in."""
+    yield from find(mind, "opening", "obstacle_0")
+    yield from mind.pause(WAIT_S)
+    yield from walk_up(mind)
+    opening, _, left = compute_axes(mind)
+    top = max(
+        float(mind.eyes.pose(name)[2] + mind.eyes.size(name)[2])
+        for name in mind.eyes.names
+        if name.startswith("obstacle") and mind.eyes.knows(name)
+    )
+    height = max(top + CLEAR, float(opening[2]) + OVER_RIM)
+    palm = mind.feel("left_palm")[:3]
+    mind.note("lift the toy")
+    yield from carry_to(mind, np.array([*palm[:2], height]))
+    mind.note("over the obstacle")
+    spot = compute_spot(mind, height)
+    # First beyond the obstacle, straight to the side, then to where it is tipped.
+    across = palm + ((spot - palm) @ left) * left
+    yield from carry_to(mind, np.array([*across[:2], height]))
+    yield from carry_to(mind, spot)
+    yield from aim(mind)
+    yield from tip(mind)
+
+
+def compute_axes(mind: Mind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middle of the opening, and the directions ahead and left of who faces it. Shapes (3,)."""
+    opening = mind.eyes.pose("opening")
+    heading = float(quat_yaw(opening[3:])) + np.pi / 2
+    head = mind.eyes.pose("head")
+    course = compute_heading(head[3:])
+    if abs(float(wrap_angle(heading - course))) > np.pi / 2:
+        heading += np.pi
+    ahead = np.array([np.cos(heading), np.sin(heading), 0])
+    return opening[:3], ahead, np.array([-ahead[1], ahead[0], 0])
+
+
+def walk_up(mind: Mind) -> Doing:
+    """Walk to where the hand is to the left of the first obstacle, if that is far."""
+    opening, ahead, left = compute_axes(mind)
+    head, palm = mind.eyes.pose("head"), mind.feel("left_palm")
+    heading = float(np.arctan2(ahead[1], ahead[0]))
+    turn = quat_from_yaw(heading - compute_heading(head[3:]))
+    offset = quat_rotate(turn, palm[:3] - head[:3])
+    hand = mind.eyes.pose("obstacle_0")[:3] + FREE * left
+    hand = hand + ((opening - hand) @ ahead) * ahead
+    hand = hand - mind.eyes.recall("toy_forward", 0.0) * ahead
+    place = np.array([*(hand - offset)[:2], heading])
+    miss, _ = compute_miss(mind, place)
+    if miss < mind.person.place_tolerance + 0.1:
+        return
+    yield from set_mode(mind, Mode.MOBILE)
+    yield from go_to(mind, place, hands=mind.body.posture.hands)
+    yield from set_mode(mind, Mode.STATIONARY)
+
+
+def compute_spot(mind: Mind, height: float) -> np.ndarray:
+    """Where the palm has to be for the toy to fall into the opening. Shape (3,)."""
+    opening, ahead, left = compute_axes(mind)
+    spot = opening - mind.eyes.recall("toy_forward", 0.0) * ahead
+    spot = spot + (mind.eyes.recall("edge", EDGE) + BEYOND_EDGE) * left
+    return np.array([*spot[:2], height])
+
+
+def compute_palm_up(mind: Mind, roll: float = 0.0) -> np.ndarray:
+    """The palm up, fingers ahead, rolled to the right. Shape (4,)."""
+    _, ahead, _ = compute_axes(mind)
+    heading = float(np.arctan2(ahead[1], ahead[0]))
+    return quat_multiply(quat_from_yaw(heading), quat_from_rpy(np.pi + roll, 0, 0))
+
+
+def carry_to(mind: Mind, point: np.ndarray) -> Doing:
+    """Bring the left palm to a point, level and slowly, correcting until it is there."""
+    for attempt in range(3):
+        error = point - mind.feel("left_palm")[:3]
+        length = float(np.linalg.norm(error))
+        if attempt and length < mind.person.hand_tolerance:
+            return
+        mind.note(f"palm {100 * length:.1f} cm to go")
+        yield from _push(mind, error, gain=1.0 if not attempt else mind.person.hand_gain)
+
+
+def aim(mind: Mind) -> Doing:
+    """Bring the toy beside the opening as precisely as one sees."""
+    opening, ahead, left = compute_axes(mind)
+    for _ in range(2 * mind.person.corrections):
+        spot = compute_spot(mind, float(opening[2]) + OVER_RIM)
+        error = spot - mind.feel("left_palm")[:3]
+        if mind.eyes.sees("toy"):
+            # What counts is where the toy lies, not where the hand is.
+            off = (opening - mind.eyes.pose("toy")[:3]) @ ahead
+            error = error + (off - error @ ahead) * ahead
+        mind.note(f"toy {100 * (error @ ahead):.1f} cm, {100 * (error @ left):.1f} cm beside")
+        fine = abs(error @ ahead) <= AIM[0] and abs(error @ left) <= AIM[1]
+        if fine and abs(error[2]) <= 1.5 * AIM[1]:
+            return
+        yield from _push(mind, error, gain=mind.person.hand_gain)
+
+
+def tip(mind: Mind) -> Doing:
+    """Free the palm from keeping level, by a double pinch of both hands, and roll it over."""
+    for _ in range(3):
+        mind.note("double pinch of both hands")
+        mind.body.double_pinch("left", "right")
+        yield from mind.finish()
+        yield from mind.pause(1.0)
+        mind.note("tip")
+        room = mind.body.compute_hands_in_room()[0]
+        tipped = mind.belief.quat_to_own(compute_palm_up(mind, TIP))
+        end = mind.body.with_hands_in_room(mind.body.posture, {"left": make_pose(room[:3], tipped)})
+        mind.body.move(end, TIP_S)
+        yield from mind.settle("left_palm")
+        yield from mind.pause(1.5)
+        up = quat_rotate(mind.feel("left_palm")[3:], np.array([0, 0, -1.0]))
+        if mind.eyes.success or np.arccos(np.clip(up[2], -1, 1)) > TILTED:
+            yield from mind.pause(1.5)
+            return
+        mind.note("the palm stays level")
+        level = mind.belief.quat_to_own(compute_palm_up(mind))
+        end = mind.body.with_hands_in_room(mind.body.posture, {"left": make_pose(room[:3], level)})
+        mind.body.move(end, TIP_S)
+        yield from mind.settle("left_palm")
+    raise GaveUp("the palm does not tip")
+
+
+def _push(mind: Mind, error: np.ndarray, gain: float) -> Doing:
+    """Move the left hand by a share of what is missing, slowly, palm up."""
+    room = mind.body.compute_hands_in_room()[0]
+    step = gain * mind.belief.vector_to_own(error)
+    length = float(np.linalg.norm(step))
+    goal = make_pose(
+        room[:3] + step + mind.scatter(0.3 * length),
+        mind.belief.quat_to_own(compute_palm_up(mind)),
+    )
+    duration = max(length / CARRY_SPEED, 0.6)
+    mind.body.move(mind.body.with_hands_in_room(mind.body.posture, {"left": goal}), duration)
+    yield from mind.settle("left_palm")
+
+
+def meet_hand(mind: Mind) -> None:
+    """Hold the left hand as the robot holds its own, before one engages."""
+    posture = mind.eyes.first_look
+    if posture is None:
+        return
+    wrists = mind.body.posture.hands.copy()
+    wrists[0] = make_pose(posture[:3] * mind.person.eye_height, posture[3:])
+    mind.body.hold(wrists)
