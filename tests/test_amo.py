@@ -47,8 +47,8 @@ class Deployment:
         self.norm = torch.load(folder / FILES[2], weights_only=False)
         self.last = np.zeros(23)
         self.stands, self.gait = True, np.array([0.25, 0.25])
-        self.short = deque([np.zeros(93)] * 10, maxlen=10)
-        self.long = deque([np.zeros(93)] * 25, maxlen=25)
+        self.short: deque[np.ndarray] = deque([np.zeros(93)] * 10, maxlen=10)
+        self.long: deque[np.ndarray] = deque([np.zeros(93)] * 25, maxlen=25)
 
     def step(self, qpos, qvel, height, torso, vx, vy, heading, arms):
         w, x, y, z = qpos[3:7]
@@ -121,9 +121,9 @@ def test_a_batch_is_its_members_and_nothing_is_written_to(folder):
         rng.normal(0, 0.1, (n, policy.memory_size)),
     ]  # fmt: skip
     kept = [each.copy() for each in inputs]
-    whole = policy.act(*inputs, Mode.MOBILE)
+    whole = policy.act(*inputs, mode=Mode.MOBILE)
     for row in range(n):
-        single = policy.act(*(each[row : row + 1] for each in inputs), Mode.MOBILE)
+        single = policy.act(*(each[row : row + 1] for each in inputs), mode=Mode.MOBILE)
         np.testing.assert_allclose(single.targets[0], whole.targets[row], atol=1e-5)
         np.testing.assert_allclose(single.memory[0], whole.memory[row], atol=1e-5)
     for before, now in zip(kept, inputs, strict=True):

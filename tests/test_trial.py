@@ -104,13 +104,13 @@ def test_transport_ends_at_the_opening_or_when_the_toy_is_lost():
     x = np.linspace(0, 1, 11)
     carried = np.stack([x, 0 * x, 1 + 0 * x], axis=1)
     palm = carried - [0, 0, 0.03]
-    name, ticks = find_transport(make_trace(carried, [0.75, 0, 0.5], palm))
-    assert name == "left_palm"
-    assert list(np.flatnonzero(ticks)) == [1, 2, 3, 4, 5, 6]  # not engaged at first; 0.7 is near
+    found = find_transport(make_trace(carried, [0.75, 0, 0.5], palm))
+    assert found is not None and found[0] == "left_palm"
+    assert list(np.flatnonzero(found[1])) == [1, 2, 3, 4, 5, 6]  # not engaged at first; 0.7 is near
     fallen = carried.copy()
     fallen[4:, 2] -= 0.5
-    name, ticks = find_transport(make_trace(fallen, [0.75, 0, 0.5], palm))
-    assert list(np.flatnonzero(ticks)) == [1, 2, 3]
+    found = find_transport(make_trace(fallen, [0.75, 0, 0.5], palm))
+    assert found is not None and list(np.flatnonzero(found[1])) == [1, 2, 3]
     trace = make_trace(carried, [5, 0, 0], palm)
     assert find_transport(replace(trace, objects={"box": trace.objects["toy"]})) is None
 

@@ -116,7 +116,7 @@ def compute_jerk(
     chosen = np.ones(len(position), bool) if chosen is None else np.asarray(chosen, bool)
     _check_rows("chosen", chosen, len(position))
     jerks = [
-        savgol_filter(position[first:last], size, JERK_ORDER, deriv=3, delta=dt, axis=0)
+        np.asarray(savgol_filter(position[first:last], size, JERK_ORDER, deriv=3, delta=dt, axis=0))
         for first, last in find_runs(chosen)
         if last - first >= size
     ]
