@@ -124,6 +124,7 @@ class Stage:
             mode=state.mode,
             fallen=state.fallen,
             success=self.status.success,
+            hints=self.task.hints,
         )
 
     def close(self) -> None:
@@ -144,6 +145,9 @@ class Stage:
         status = dataclasses.replace(self.task.update(), collisions=collisions)
         if fallen and not status.failure:
             status = dataclasses.replace(status, failure="the robot fell")
+        if collisions and self.task.ends_on_collision and not status.failure:
+            failure = "the {} touched {}".format(*collisions[0])
+            status = dataclasses.replace(status, failure=failure)
         failed = bool(status.failure) and self._success_time is None
         if status.success and not failed and self._success_time is None:
             self._success_time = time

@@ -60,6 +60,8 @@ class Task(ABC):
     """Bodies that stand still and that a robot may run into."""
     handled: tuple[str, ...] = ()
     """Those of `furniture` that the hands may touch."""
+    ends_on_collision: ClassVar[bool] = False
+    """Whether running into furniture or a wall loses the episode."""
     passable: tuple[str, ...] = ()
     """Geoms of `furniture` over which hands work, so that a planner must not keep clear of them."""
 
@@ -119,6 +121,7 @@ def get_task(name: str) -> type[Task]:
     from xop_lerobot.tasks import (  # noqa: F401, PLC0415 they register themselves
         box_pick_and_place,
         dual_point_touch,
+        non_prehensile_transport,
     )
 
     return TASKS[name]

@@ -1,0 +1,88 @@
+"""The open left palm: how it is turned up at the start, and what may be fitted to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.morphology.links import FLOOR_BIT, OBJECT_BIT
+from xop_lerobot.retarget.arm_ik import ArmIk
+from xop_lerobot.tasks.layout import Pad, Reach
+from xop_lerobot.transforms import make_pose, pose_inverse, pose_multiply, quat_from_rpy
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from xop_lerobot.morphology.morphology import Morphology
+
+PALM_UP = quat_from_rpy(math.pi, 0, 0)
+"""A palm that faces up, fingers forward: Z, out of the back of the hand, points down."""
+TRAY_HALF = (0.05, 0.05, 0.003)
+"""Half the edges of the plate on hands that are no flat surface: along, across, thick [m]."""
+BARE_EDGE = 0.034
+"""From the middle of a hand without a plate to its edge [m]."""
+_STEPS, _DT = 150, 0.04
+
+
+def find_start_arms(
+    morphology: Morphology, position: np.ndarray, palm_in_wrist: np.ndarray
+) -> dict[str, float]:
+    """Left arm angles that hold the palm up at `position` while the robot stands.
+
+    Args:
+        morphology: The robot.
+        position: Of the palm's site, robot at the origin, heading along X [m]. Shape (3,).
+        palm_in_wrist: Pose of the palm's site in the wrist's frame. Shape (7,).
+    """
+    arm = morphology.arms[0]
+    ik = ArmIk(morphology)
+    goal = pose_multiply(make_pose(position, PALM_UP), pose_inverse(palm_in_wrist))
+    joints = [joint for each in morphology.arms for joint in each.joints]
+    angles = np.array([morphology.arm_rest.get(joint, 0.0) for joint in joints])
+    standing = morphology.standing_qpos()
+    for _ in range(_STEPS):
+        angles = ik.solve(standing, angles, {arm.frame: goal}, _DT)
+    return {joint: float(angles[joints.index(joint)]) for joint in arm.joints}
+
+
+def add_tray(spec: mujoco.MjSpec, site: str, pad: Pad) -> None:
+    """Fix a flat plate of 10 cm by 10 cm without a rim to the palm's side of a hand.
+
+    Its edge towards the wrist is that of the flat of the hand. It weighs nothing.
+    """
+    import mujoco  # noqa: PLC0415
+
+    frame = next(each for each in spec.sites if each.name == site)
+    offset = make_pose(
+        np.array([compute_tray_forward(pad), 0, -pad.depth - TRAY_HALF[2]]), [1.0, 0, 0, 0]
+    )
+    pose = pose_multiply(make_pose(np.array(frame.pos), np.array(frame.quat)), offset)
+    frame.parent.add_geom(
+        name="left_tray",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=TRAY_HALF,
+        pos=pose[:3],
+        quat=pose[3:],
+        mass=0,
+        rgba=(0.20, 0.22, 0.25, 1),
+        contype=0,
+        conaffinity=FLOOR_BIT | OBJECT_BIT,
+        group=2,
+    )
+
+
+def compute_tray_forward(pad: Pad) -> float:
+    """Middle of the tray ahead of the palm's site [m]."""
+    return pad.wrist_end + 0.002 + TRAY_HALF[0]
+
+
+def compute_start(reach: Reach, left: float) -> np.ndarray:
+    """Where the palm begins: as at rest, a little nearer and higher. Shape (3,)."""
+    return np.array([0.92 * reach.forward, left, reach.height + 0.03])
+
+
+HAS_TRAY: Mapping[str, bool] = {"g1": False, "rby1": True}
+"""Whether a robot's hand needs the plate: G1's is flat, between the fingers of RB-Y1 is a gap."""
