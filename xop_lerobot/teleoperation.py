@@ -76,6 +76,7 @@ class Teleoperation:
         self._settings = OnlineSettings(self.morphology, config.retargeter)
         model = build_model(self.morphology, "planning", scene=info.scene)
         policy = make_policy(info.low_level, info.low_level_path)
+        policy.adapt(model)
         obstacles: tuple[Obstacle, ...] | None = None
         if self.morphology.hull_points:  # the planning model holds the floor alone
             scene = build_model(self.morphology, "full", scene=info.scene)
