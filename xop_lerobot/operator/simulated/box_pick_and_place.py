@@ -46,8 +46,6 @@ ROBOT_LAG = 0.35
 """How much later than oneself a robot is known to move [s]."""
 PRESS = 0.03
 """Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
-SEEN_LATE = 0.04
-"""How much of that is done by the time that a stopped hand is seen [m]."""
 PRESS_MORE = 0.02
 """How much more they press after a box has slipped [m]."""
 APPROACHES = 4
@@ -167,7 +165,7 @@ def pick_up(mind: Mind) -> Doing:
     for attempt in range(GRASPS):
         yield from bring_beside(mind)
         rest = float(mind.eyes.pose("box")[2])
-        yield from close(mind, max(press - SEEN_LATE, 0.0) + attempt * PRESS_MORE)
+        yield from close(mind, press + attempt * PRESS_MORE)
         mind.note("lift")
         yield from shift_hands(mind, np.array([0, 0, LIFT]), CARRY_SPEED)
         yield from mind.settle()
