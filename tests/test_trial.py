@@ -107,6 +107,9 @@ def test_transport_ends_at_the_opening_or_when_the_toy_is_lost():
     found = find_transport(make_trace(carried, [0.75, 0, 0.5], palm))
     assert found is not None and found[0] == "left_palm"
     assert list(np.flatnonzero(found[1])) == [1, 2, 3, 4, 5, 6]  # not engaged at first; 0.7 is near
+    times = {"free_time_s": 0.1, "let_go_time_s": 0.2}
+    found = find_transport(make_trace(carried, [0.75, 0, 0.5], palm), times)
+    assert found is not None and list(np.flatnonzero(found[1])) == [3, 4]  # 0.12 and 0.16 s
     fallen = carried.copy()
     fallen[4:, 2] -= 0.5
     found = find_transport(make_trace(fallen, [0.75, 0, 0.5], palm))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -56,7 +57,7 @@ def compute_metrics(trial: Trial) -> dict[str, float]:
     return {
         "abp": power.absolute,
         "abp_signed": power.signed,
-        **_compute_palm_metrics(trace, dt),
+        **_compute_palm_metrics(trial),
         "head_error": head.position,
         "head_error_p95": head.position_p95,
         "head_angle": head.angle,
@@ -100,11 +101,19 @@ def find_lower_body(morphology: Morphology) -> tuple[np.ndarray, np.ndarray]:
     return np.array(actuators, int), np.array(dofs, int)
 
 
-def find_transport(trace: Trace) -> tuple[str, np.ndarray] | None:
+def find_transport(
+    trace: Trace, figures: Mapping[str, float] | None = None
+) -> tuple[str, np.ndarray] | None:
     """Find the palm that carries an object to an opening, and the ticks before the release.
 
-    The release begins as soon as the object is within 10 cm of the opening, seen from above, or
-    has left the palm; whatever the method, and whether or not it falls in.
+    Transport begins when the object lies free on the palm. The release begins as soon as it is
+    within 10 cm of the opening, seen from above, or has left the palm; whatever the method, and
+    whether or not it falls in.
+
+    Args:
+        trace: What happened.
+        figures: The task's own: `free_time_s`, when the object was no longer held, if it was,
+            and `let_go_time_s`, when it left the palm [s].
 
     Returns:
         Frame of the palm and the ticks, shape (n,); None where nothing is carried to an opening.
@@ -119,12 +128,16 @@ def find_transport(trace: Trace) -> tuple[str, np.ndarray] | None:
     palm = min(gaps, key=lambda name: float(gaps[name][0]))
     over = np.linalg.norm((toy - opening)[:, :2], axis=1) < RELEASE_RADIUS
     lost = gaps[palm] > gaps[palm][0] + LOST_DISTANCE
+    figures = figures or {}
+    lost |= trace.time >= figures.get("let_go_time_s", math.inf)
     ended = np.logical_or.accumulate(over | lost)
-    return palm, trace.engaged & ~ended
+    begun = trace.time >= figures.get("free_time_s", -math.inf)
+    return palm, trace.engaged & begun & ~ended
 
 
-def _compute_palm_metrics(trace: Trace, dt: float) -> dict[str, float]:
-    transport = find_transport(trace)
+def _compute_palm_metrics(trial: Trial) -> dict[str, float]:
+    trace, dt = trial.trace, trial.dt
+    transport = find_transport(trace, trial.status.figures)
     if transport is None:
         jerks = [
             compute_jerk(trace.frames[name][:, :3], dt, trace.engaged)
