@@ -19,7 +19,7 @@ import numpy as np
 
 import xop_lerobot.low_level.falcon  # noqa: F401 registers the policy
 from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop
@@ -40,8 +40,12 @@ VARIANTS = {
     "NLS, contact at z = 0": SyncConfig(recursive=False, project_velocity=False, equilibrium=False),
     "NLS + velocity": SyncConfig(recursive=False),
     "NLS + velocity + memory": SyncConfig(),
+    "all, and the prediction": SyncConfig(),
 }
 """Ways to synchronise; raw is the measurement as it is."""
+PREDICTED = "all, and the prediction"
+"""The one that also gets the base's velocity that was predicted from its own last state, as in a
+teleoperation, where the last plan tells it."""
 
 
 @dataclass(frozen=True)
@@ -102,14 +106,20 @@ def run(case: Case, noise: str, seed: int, duration: float, errors: dict[str, Er
     loop.reset(seed)
     rollout = PolicyRollout(model, policy, 1)
     syncs = {name: StateSync(morphology, model, config) for name, config in VARIANTS.items()}
+    states: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for tick in range(round(duration / TICK)):
         action = _make_action(morphology, case, tick * TICK)
+        before = loop.state
         loop.execute(action, TICK)
         state = loop.state
+        expected = None
+        if tick:
+            expected = _predict_velocity(rollout, before, loop.action, *states[PREDICTED])
         states = {"raw": (state.qpos, state.qvel)}
         for name, sync in syncs.items():
+            given = expected if name == PREDICTED else None
             start = time.perf_counter()
-            synced = sync.synchronise(state.time, state.qpos, state.qvel, case.mode)
+            synced = sync.synchronise(state.time, state.qpos, state.qvel, case.mode, given)
             errors[name].seconds.append(time.perf_counter() - start)
             states[name] = (synced.qpos, synced.qvel)
         if tick * TICK < SETTLE_S:
@@ -149,6 +159,20 @@ def _predict(
     commands = np.broadcast_to(action.command, (1, max(HORIZONS), len(action.command)))
     predicted = rollout.predict(qpos, qvel, state.memory, commands, action.arms, action.mode)
     return predicted.qpos[0, :, :3] - qpos[:3]
+
+
+def _predict_velocity(
+    rollout: PolicyRollout,
+    state: RobotState,
+    action: RobotAction,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+) -> np.ndarray:
+    """Predicted linear velocity of the base a tick later [m/s]. Shape (3,)."""
+    steps = round(TICK / POLICY_DT)
+    commands = np.broadcast_to(action.command, (1, steps, len(action.command)))
+    predicted = rollout.predict(qpos, qvel, state.memory, commands, action.arms, action.mode)
+    return predicted.qvel[0, -1, :3]
 
 
 def _compute_up(quat: np.ndarray) -> np.ndarray:

@@ -120,6 +120,49 @@ def test_a_settled_robot_without_noise_is_left_where_it_is(name):
     np.testing.assert_allclose(synced.qvel, measured.qvel, atol=1e-3)
 
 
+def synchronise_all(sync, states, mode, expected):
+    """Synchronise states in turn, each with the velocity in `expected`."""
+    pairs = zip(states, expected, strict=True)
+    return [sync.synchronise(s.time, s.qpos, s.qvel, mode, v) for s, v in pairs]
+
+
+def compute_velocity_error(states, synced):
+    pairs = zip(states[50:], synced[50:], strict=True)
+    return np.sqrt(np.mean([np.square(y.qvel[:3] - s.true_qvel[:3]) for s, y in pairs]))
+
+
+def test_a_predicted_velocity_is_averaged_with_the_measured_one():
+    states = record("g1", "mild", 0, Mode.MOBILE, vx=0.4)
+    rng = np.random.default_rng(0)
+    near = [state.true_qvel[:3] + 0.02 * rng.standard_normal(3) for state in states]
+    robot = make_robot("g1")
+    plain = synchronise_all(make_sync(robot), states, Mode.MOBILE, [None] * len(states))
+    helped = synchronise_all(make_sync(robot), states, Mode.MOBILE, near)
+    assert compute_velocity_error(states, helped) < 0.7 * compute_velocity_error(states, plain)
+
+
+@pytest.mark.parametrize("bad", [np.full(3, 2.0), np.full(3, np.nan)])
+def test_a_predicted_velocity_that_is_far_off_is_no_news(bad):
+    states = record("g1", "mild", 0, Mode.STATIONARY, seconds=1.0)
+    robot = make_robot("g1")
+    plain = synchronise_all(make_sync(robot), states, Mode.STATIONARY, [None] * len(states))
+    pushed = synchronise_all(make_sync(robot), states, Mode.STATIONARY, [bad] * len(states))
+    for one, other in zip(plain, pushed, strict=True):
+        np.testing.assert_array_equal(one.qpos, other.qpos)
+        np.testing.assert_array_equal(one.qvel, other.qvel)
+
+
+def test_the_height_of_a_walking_robot_outlasts_the_foot_that_told_it():
+    errors = []
+    for seed in range(2):
+        states = record("g1", "mild", seed, Mode.MOBILE, vx=0.4)
+        sync = make_sync(make_robot("g1"))
+        synced = synchronise_all(sync, states, Mode.MOBILE, [None] * len(states))
+        pairs = zip(states[50:], synced[50:], strict=True)
+        errors += [one.qpos[2] - state.true_qpos[2] for state, one in pairs]
+    assert np.sqrt(np.mean(np.square(errors))) < 2.0e-3  # 2.3 mm if each contact stands alone
+
+
 @pytest.mark.parametrize("name", ["g1", "rby1"])
 def test_a_robot_in_the_closed_loop_without_noise_is_left_where_it_is(name):
     sync = make_sync(make_robot(name))

@@ -241,7 +241,8 @@ class Teleoperation:
         """Put the measured state in accordance with the ground; the truth stays beside it."""
         if self._sync is None:
             return state, None
-        synced = self._sync.synchronise(state.time, state.qpos, state.qvel, state.mode)
+        expected = self._follower.predict_velocity(state.time, self._sync.time)
+        synced = self._sync.synchronise(state.time, state.qpos, state.qvel, state.mode, expected)
         return dataclasses.replace(state, qpos=synced.qpos, qvel=synced.qvel), synced
 
     def _compute_frames(self, state: RobotState) -> dict[str, np.ndarray]:

@@ -274,6 +274,7 @@ class MpcRetargeter(Retargeter):
             commands=planned[:, :count],
             mode=mode,
             qpos=prediction.qpos[best],
+            velocities=prediction.qvel[best, :, :3],
             arms={names[i]: planned[:, i] for i in np.flatnonzero(acting) if i >= count},
             cost={name: _finite(term[best]) for name, term in terms.items()},
             health={"intervention": float(verdict.intervention), "risk": verdict.risk},

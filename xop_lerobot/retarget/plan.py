@@ -32,6 +32,8 @@ class Plan:
         commands: The planned sequence, one for each control step. Shape (H, k).
         mode: The mode it is for.
         qpos: Predicted positions under the plan's best sample; empty for `direct`. (H + 1, nq).
+        velocities: Predicted linear velocity of the base under that sample, world axes [m/s]; empty
+            for `direct`. Shape (H + 1, 3).
         arms: Targets of the arm joints that the retargeter decided itself, by joint, one for
             each control step [rad]; the others are left to inverse kinematics. Shapes (H,).
         cost: Cost of the best sample by term.
@@ -45,6 +47,7 @@ class Plan:
     commands: np.ndarray
     mode: Mode
     qpos: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    velocities: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     arms: Mapping[str, np.ndarray] = field(default_factory=dict)
     cost: Mapping[str, float] = field(default_factory=dict)
     health: Mapping[str, float] = field(default_factory=dict)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.delay import LatencyMeter, StatePredictor
@@ -76,6 +78,24 @@ class PlanFollower:
             self.background.submit(state, goal, self.latency.steps)
             self._asked_time = state.time
         self.current = self.background.at(state.time)
+
+    def predict_velocity(self, time: float, since: float) -> np.ndarray | None:
+        """Velocity of the base at `time` by the newest plan, for the state synchronisation.
+
+        Args:
+            time: The robot's clock [s].
+            since: When the state was measured that the plan must have started from [s]. An older
+                plan tells nothing that the state of `since` does not know already.
+
+        Returns:
+            Linear velocity, world axes [m/s], shape (3,); None where no plan tells.
+        """
+        if self.current is None:
+            return None
+        newest = self.current if self.background is None else self.background.latest
+        if newest is None or newest.measured != since:
+            return None
+        return newest.predict_velocity(time)
 
     def _measure_latency(self, background: BackgroundPlanner, time: float) -> None:
         newest = background.latest

@@ -54,6 +54,21 @@ class StampedPlan(NamedTuple):
         step = self.get_step(time)
         return {name: float(angles[step]) for name, angles in self.plan.arms.items()}
 
+    def predict_velocity(self, time: float) -> np.ndarray | None:
+        """Predicted linear velocity of the base at `time`, world axes [m/s].
+
+        Returns:
+            Shape (3,); None beyond what was predicted.
+        """
+        velocities, step = self.plan.velocities, (time - self.time) / POLICY_DT
+        if not -0.5 <= step <= len(velocities) - 0.5:  # noqa: PLR2004 half a step is nothing
+            return None
+        step = min(max(step, 0.0), len(velocities) - 1.0)
+        first = min(int(step), max(len(velocities) - 2, 0))
+        pair = velocities[first : first + 2]
+        velocity = pair[0] + (step - first) * (pair[-1] - pair[0])
+        return velocity if np.isfinite(velocity).all() else None
+
 
 class PlanTrack:
     """The last few plans; each counts from when it is due until the next one is.

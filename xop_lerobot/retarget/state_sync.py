@@ -68,8 +68,9 @@ class StateSync:
 
     1. The memory is carried to the present: the last state by its velocity.
     2. Which contacts count (`StanceMemory`), and the velocity that they allow
-       (`velocity_projection`).
-    3. The measurement, averaged with what was carried over (`SensorFilter`).
+       (`velocity_projection`), of the measured one and the one that was predicted.
+    3. The measurement, averaged with what was carried over (`SensorFilter`); the height also
+       with what the contacts told of it before, as while a foot touches down they tell little.
     4. Eq. 4 by SQP (`SyncTask`), each step by mink and DAQP within the joint limits.
 
     Args:
@@ -121,14 +122,28 @@ class StateSync:
         self._last_time = -np.inf
         self._forget()
 
+    @property
+    def time(self) -> float:
+        """When the last state was measured [s]; minus infinity before the first."""
+        return self._last_time
+
     def _forget(self) -> None:
         self._filter.reset()
         self.stance.reset()
         self._bias.reset()
         self._noise = 1.0
+        self._base_variance = np.full(3, np.inf)
+        self._height_variance = math.inf
         self._is_new = True
 
-    def synchronise(self, time: float, qpos: np.ndarray, qvel: np.ndarray, mode: Mode) -> Synced:
+    def synchronise(
+        self,
+        time: float,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        mode: Mode,
+        expected: np.ndarray | None = None,
+    ) -> Synced:
         """Find the state that measurement, contacts and memory agree on; never raises.
 
         Args:
@@ -136,6 +151,8 @@ class StateSync:
             qpos: Measured generalised position. Shape (nq,).
             qvel: Measured generalised velocity. Shape (nv,).
             mode: Mode the robot is in: which contacts count.
+            expected: Linear velocity of the base that the planner predicted for `time` when it
+                started from the last state, world axes [m/s]; None for none. Shape (3,).
 
         Returns:
             The state; the measurement with status `MEASUREMENT` where there is no solution, and
@@ -148,7 +165,7 @@ class StateSync:
             qpos, qvel = np.asarray(qpos), np.asarray(qvel)
             if self._last is not None and self._is_seen(time, qpos, qvel):
                 return self._last
-            self._last = self._solve(float(time), qpos, qvel, mode)
+            self._last = self._solve(float(time), qpos, qvel, mode, expected)
             self._seen = (qpos.copy(), qvel.copy())
         except Exception as error:  # noqa: BLE001 whatever it is, the control loop goes on
             if not self.failures:
@@ -169,7 +186,14 @@ class StateSync:
             qpos, qvel = self._last.qpos, self._last.qvel
         return Synced(freeze(qpos), freeze(qvel), 0.0, SyncStatus.MEASUREMENT, 0)
 
-    def _solve(self, time: float, qpos: np.ndarray, qvel: np.ndarray, mode: Mode) -> Synced:
+    def _solve(
+        self,
+        time: float,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        mode: Mode,
+        expected: np.ndarray | None,
+    ) -> Synced:
         config, configuration = self.config, self._configuration
         dt = time - self._last_time
         if not (config.recursive and 0 < dt <= config.max_gap_s):
@@ -185,7 +209,7 @@ class StateSync:
         if config.recursive:
             qvel = qvel.copy()
             qvel[:3] = self._bias.update(qpos[:3], qvel[:3], dt)
-        velocity, variance = self._project(qvel)
+        velocity, variance = self._project(qvel, None if last is None else expected)
         mean, carried = velocity, variance
         if last is not None:
             mean = 0.5 * (velocity + last.qvel)
@@ -197,6 +221,7 @@ class StateSync:
             self.stance.reset()
             self.stance.update_contacts(configuration.data, mode, 0.0)
             velocity, _ = self._project(qvel)
+            last = None
         std = self._filter.std
         self.stance.remember(
             self.task.compute_places(configuration.data),
@@ -206,9 +231,17 @@ class StateSync:
             # The noisier velocities are, the less they tell of feet that creep.
             self.config.memory_s / math.sqrt(self._noise),
         )
+        if last is not None:
+            height = last.qpos[2] + mean[2] * dt
+            variance = std[2] ** 2
+            share = variance / (variance + self._height_variance + carried[2] * dt * dt)
+            measured[2] += share * (height - measured[2])
+            std[2] *= math.sqrt(1 - share)
         self.task.set_measurement(measured, std)
-        active = self.stance.active
-        self.task.set_active(active, self.stance.compute_std(), self.stance.places)
+        active, contact_std = self.stance.active, self.stance.compute_std()
+        self.task.set_active(active, contact_std, self.stance.places)
+        row = self.task.height_row
+        self._height_variance = 1 / (std[2] ** -2 + sum(one[row] ** -2 for one in contact_std))
         iterations, bounded = self._descend()
         self._last_time, self._is_new = time, False
         errors = self.task.compute_height_errors(configuration)
@@ -224,8 +257,14 @@ class StateSync:
             rotation=_compute_angle(solution[3:7], qpos[3:7]),
         )
 
-    def _project(self, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _project(
+        self, qvel: np.ndarray, expected: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Project the velocity on the contacts that hold.
+
+        Args:
+            qvel: Measured velocity. Shape (nv,).
+            expected: Predicted linear velocity of the base, None for none. Shape (3,).
 
         Returns:
             Velocity and its variances. Shapes (nv,), (nv,).
@@ -233,6 +272,9 @@ class StateSync:
         variance = self._noise * self._velocity_variance
         if not self.config.project_velocity:
             return qvel, variance
+        if expected is not None:
+            qvel, variance = self._blend(qvel, variance, expected)
+        self._base_variance = variance[:3]
         data, stance = self._configuration.data, self.stance
         jacobians, variances, disagreements = [], [], []
         for index in stance.active:
@@ -257,9 +299,31 @@ class StateSync:
             variances.append(np.full(2, self.config.contact_rate**2))
         if not jacobians:
             return qvel, variance
-        return project_velocity(
+        velocity, left = project_velocity(
             qvel, variance, np.concatenate(jacobians), np.concatenate(variances)
         )
+        self._base_variance = left[:3]
+        return velocity, left
+
+    def _blend(
+        self, qvel: np.ndarray, variance: np.ndarray, expected: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Average the base's measured linear velocity with the predicted one, as a Kalman filter.
+
+        A robot that is pushed moves as nobody predicted: what disagrees by too much is no news.
+
+        Returns:
+            Velocity and its variances. Shapes (nv,), (nv,).
+        """
+        own, prior = variance[:3], self._base_variance + self.config.prediction**2
+        error = expected - qvel[:3]
+        if not (np.square(error) < self.config.gate**2 * (own + prior)).all():
+            return qvel, variance
+        gain = own / (own + prior)
+        qvel, variance = qvel.copy(), variance.copy()
+        qvel[:3] += gain * error
+        variance[:3] *= 1 - gain
+        return qvel, variance
 
     def _observe_noise(self, disagreement: float) -> None:
         """Follow the noise of the velocities: the median of `disagreement` shall be 1.

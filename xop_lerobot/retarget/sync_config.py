@@ -37,6 +37,8 @@ class SyncConfig:
         velocity: Measured linear velocity of the base [m/s].
         gyro: Measured angular velocity of the base [rad/s].
         joint_rate: Measured joint velocity [rad/s], a tenth in m/s on sliding joints.
+        prediction: Velocity of the base that the planner predicts from one tick to the next,
+            beyond what was wrong with the state that it started from [m/s].
         contact_height: Height of a contact point over its equilibrium [m].
         contact_tilt: Tilt of a foot over the ground, or of an axle [rad].
         stance_position: Remembered place of a standing foot, at best [m].
@@ -74,6 +76,7 @@ class SyncConfig:
     velocity: float = 0.03
     gyro: float = 0.02
     joint_rate: float = 0.1
+    prediction: float = 0.02
     contact_height: float = 0.0005
     contact_tilt: float = 0.005
     stance_position: float = 0.0015

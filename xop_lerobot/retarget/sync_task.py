@@ -56,6 +56,8 @@ class SyncTask(mink.Task):
         self.model = model
         self._num_own = num_own = model.nv
         self._per_contact = 2 if wheeled else 7
+        self.height_row = 0 if wheeled else 2
+        """Which of the rows of a contact is its height."""
         rows = num_own + self._per_contact * len(self.contacts)
         self._jacobian = np.zeros((rows, model.nv))
         self._jacobian[:num_own] = np.eye(num_own)
