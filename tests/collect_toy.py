@@ -58,9 +58,10 @@ class Wait(Task):
 def obey() -> None:
     """Do once what a test has asked for."""
     folder = os.environ.get("XOP_TEST_ORDERS")
-    for order in Path(folder).iterdir() if folder else ():
+    orders = [each for each in Path(folder).iterdir() if each.suffix != ".pid"] if folder else []
+    for order in orders:
         try:
-            order.unlink()
+            order.rename(order.with_name(f"{os.getpid()}.pid"))
         except FileNotFoundError:  # another worker was first
             continue
         if order.name.startswith("die"):

@@ -13,12 +13,12 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from lerobot.datasets import LeRobotDataset
-from toy_robot import SMALL
 
 import xop_lerobot.dataset.collect_folder as folder_module
 from xop_lerobot.dataset.collect import collect, main, make_parser, parse_arguments
@@ -28,11 +28,19 @@ from xop_lerobot.dataset.collect_merge import merge_attempts
 from xop_lerobot.dataset.collect_pool import WorkerFailed
 from xop_lerobot.dataset.collect_worker import Collector
 from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.errors import BadValue, UnknownName, XopError
+from xop_lerobot.operator.devices import DeviceConfig, make_device
 
 REPO = Path(__file__).parents[1]
 CONFIG = CollectConfig(
-    "toy", "wait", seed=2, device="looker", method="direct", plugins=("collect_toy",), **SMALL
+    "toy",
+    "wait",
+    seed=2,
+    device="looker",
+    method="direct",
+    plugins=("collect_toy",),
+    width=64,
+    height=48,
 )
 OUTCOMES = [True, False, False, True, False]
 """Of the first episodes with the seed above; see `collect_toy.Wait`."""
@@ -71,15 +79,19 @@ def serial(orders, tmp_path_factory) -> Path:
     return root
 
 
-def read_content(root: Path) -> pd.DataFrame:
+def read_content(root: Path) -> Any:
     """All rows of a dataset, without the host's clock."""
     table = pd.concat(pd.read_parquet(path) for path in sorted(root.glob("data/*/*.parquet")))
     return table.drop(columns=list(HOST)).reset_index(drop=True)
 
 
+def load(root: Path) -> Any:
+    return LeRobotDataset("local/toy", root=root)
+
+
 def assert_same_content(root: Path, other: Path) -> None:
     pd.testing.assert_frame_equal(read_content(root), read_content(other))
-    one, two = (LeRobotDataset("local/toy", root=each) for each in (root, other))
+    one, two = (load(each) for each in (root, other))
     for index in range(0, len(one), 7):
         picture, twin = (each[index]["observation.images.head"] for each in (one, two))
         assert np.array_equal(picture, twin), index
@@ -94,7 +106,7 @@ def assert_same_content(root: Path, other: Path) -> None:
 
 
 def test_dataset_loads_and_says_what_succeeded(serial):
-    dataset = LeRobotDataset("local/toy", root=serial)
+    dataset = load(serial)
     assert (dataset.num_episodes, dataset.fps) == (5, 25)
     assert dataset.meta.robot_type == "xop_toy"
     assert list(dataset.meta.tasks.index) == ["wait for a moment"]
@@ -165,6 +177,19 @@ def test_format_is_that_of_a_recorded_dataset(serial, tmp_path):
     assert schemas[0] == schemas[1]
 
 
+def test_operator_columns_play_again(serial):
+    device = make_device(DeviceConfig("replay", path=str(serial), episode=3))
+    device.connect()
+    device.start(0.0)
+    rows = read_content(serial).query("episode_index == 3 and `operator.engaged`")
+    assert len(rows) > 20
+    for index in (0, 5, len(rows) - 1):
+        frame = device.read(index / 25)
+        assert frame is not None
+        assert frame.head == pytest.approx(rows["operator.head"].iloc[index], abs=1e-6)
+        assert frame.left_wrist == pytest.approx(rows["operator.left_wrist"].iloc[index], abs=1e-6)
+
+
 def test_parallel_is_serial(serial, tmp_path):
     result = collect(CONFIG, tmp_path / "data", 5, "local/toy", workers=3)
     assert result.frames == len(read_content(serial))
@@ -203,7 +228,7 @@ def test_only_successful(serial, tmp_path):
     )
     attempts = json.loads((root / "meta/xop/collect.json").read_text())["attempts"]
     assert [row["failure"] for row in attempts] == ["", "too long", "too long", "", "too long"]
-    assert LeRobotDataset("local/toy", root=root)[0]["observation.images.head"].shape == (3, 48, 64)
+    assert load(root)[0]["observation.images.head"].shape == (3, 48, 64)
 
 
 # Kills.
@@ -222,6 +247,14 @@ def wait_for(condition, seconds: float = 120) -> None:
         time.sleep(0.02)
 
 
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that nobody has waited for yet does not."""
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
+
+
 def test_kill_and_go_on(serial, orders, tmp_path, monkeypatch):
     """Killed with episodes finished and under way: none is lost, and none is made twice."""
     root = tmp_path / "data"
@@ -231,9 +264,12 @@ def test_kill_and_go_on(serial, orders, tmp_path, monkeypatch):
     wait_for(lambda: len(list(work.glob("[0-9]*/attempt.json"))) >= 2)
     (orders / "wait-1").touch()
     (orders / "wait-2").touch()
-    wait_for(lambda: not list(orders.iterdir()) or not work.exists())
+    wait_for(lambda: not list(orders.glob("wait-*")) or not work.exists())
     process.send_signal(signal.SIGKILL)
     process.wait()
+    workers = [int(path.stem) for path in orders.glob("*.pid")]
+    assert workers
+    wait_for(lambda: not any(is_alive(pid) for pid in workers))
     saved = {path: path.stat().st_mtime_ns for path in work.glob("[0-9]*/attempt.json")}
     assert 2 <= len(saved) < 5
     assert not root.exists()
@@ -259,7 +295,7 @@ def test_sigterm_ends_in_one_line(orders, tmp_path, capsys):
     (orders / "wait-1").touch()
 
     def terminate() -> None:
-        wait_for(lambda: not list(orders.iterdir()))
+        wait_for(lambda: not list(orders.glob("wait-*")))
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=terminate).start()
@@ -384,7 +420,9 @@ def test_cut_at_any_file_of_the_exchange(serial, tmp_path, monkeypatch):
 # What is refused.
 
 
-def check_refused(config: CollectConfig, root: Path, message: str, kind=FolderTaken) -> None:
+def check_refused(
+    config: CollectConfig, root: Path, message: str, kind: type[XopError] = FolderTaken
+) -> None:
     before = sorted(root.parent.rglob("*"))
     with pytest.raises(kind) as error:
         collect(config, root, 5)

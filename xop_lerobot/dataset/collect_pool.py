@@ -11,7 +11,7 @@ import traceback
 from collections import Counter
 from collections.abc import Generator, Sequence
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import BaseContext
+from multiprocessing.context import ForkServerContext, SpawnContext
 from typing import TYPE_CHECKING
 
 from xop_lerobot.dataset.collect_config import CollectConfig
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
 
     from xop_lerobot.dataset.collect_folder import Attempt, CollectFolder
+
+type Context = ForkServerContext | SpawnContext
 
 _MOST_DEATHS = 2
 """How often a worker may die over one episode before the run is given up."""
@@ -43,7 +45,7 @@ class WorkerFailed(XopError):
 class _Worker:
     """One process, and the episode that it is at."""
 
-    def __init__(self, context: BaseContext, arguments: tuple) -> None:
+    def __init__(self, context: Context, arguments: tuple) -> None:
         self.connection, theirs = context.Pipe()
         self.process: BaseProcess = context.Process(
             target=_work, args=(theirs, *arguments), daemon=True
@@ -150,7 +152,7 @@ def _note_death(worker: _Worker, deaths: Counter[int]) -> int:
     return index
 
 
-def _make_context() -> BaseContext:
+def _make_context() -> Context:
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
