@@ -209,7 +209,9 @@ class StateSync:
         if config.recursive:
             qvel = qvel.copy()
             qvel[:3] = self._bias.update(qpos[:3], qvel[:3], dt)
-        velocity, variance = self._project(qvel, None if last is None else expected)
+        if last is None or self.morphology.wheeled:  # wheels tell more than any prediction
+            expected = None
+        velocity, variance = self._project(qvel, expected)
         mean, carried = velocity, variance
         if last is not None:
             mean = 0.5 * (velocity + last.qvel)
