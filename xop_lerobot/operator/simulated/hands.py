@@ -20,11 +20,11 @@ from xop_lerobot.transforms import (
     quat_to_rpy,
 )
 
-MARGIN = 0.15
+MARGIN = 0.08
 """How far within the field of view a person wants to have what the hands work on [rad]."""
-NOD_MORE = 0.12
+NOD_MORE = 0.08
 """Least further nod when a hand is not in view [rad]."""
-LARGEST_NOD = 0.6
+LARGEST_NOD = 0.45
 """Largest nod [rad]."""
 KNEES = 0.3
 """How much farther out hands work for each metre of squatting [m/m]."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.simulated.body import SIDES
+from xop_lerobot.operator.simulated.hands import take_posture
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.operator.simulated.walking import compute_miss, find, go_to, set_mode
+from xop_lerobot.operator.simulated.walking import compute_miss, go_to, set_mode
 from xop_lerobot.transforms import (
     make_pose,
     quat_from_rpy,
@@ -18,6 +22,8 @@ from xop_lerobot.transforms import (
     wrap_angle,
 )
 
+NOD = 0.25
+"""How far the person nods to see the own palm [rad]."""
 CLEAR = 0.10
 """The palm passes so far over the tops of the obstacles [m]."""
 OVER_RIM = 0.08
@@ -44,7 +50,10 @@ WAIT_S = 2.5
 
 def carry_toy(mind: Mind) -> Doing:
     """Take the toy on the palm to the container and tip it in."""
-    yield from find(mind, "opening", "obstacle_0")
+    while mind.eyes.is_blind:
+        yield
+    mind.eyes.look_over()
+    yield from look_down(mind)
     yield from mind.pause(WAIT_S)
     yield from walk_up(mind)
     opening, _, left = compute_axes(mind)
@@ -65,6 +74,14 @@ def carry_toy(mind: Mind) -> Doing:
     yield from carry_to(mind, spot)
     yield from aim(mind)
     yield from tip(mind)
+
+
+def look_down(mind: Mind) -> Doing:
+    """Nod to see hand and opening; the hands stay where they are in the room."""
+    body, last = mind.body, mind.body.posture
+    keep = dict(zip(SIDES, body.compute_hands_in_room(), strict=True))
+    posture = replace(last, look=np.array([0.0, NOD]))
+    yield from take_posture(mind, body.with_hands_in_room(posture, keep))
 
 
 def compute_axes(mind: Mind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,6 +113,7 @@ def walk_up(mind: Mind) -> Doing:
     yield from set_mode(mind, Mode.MOBILE)
     yield from go_to(mind, place, hands=mind.body.posture.hands)
     yield from set_mode(mind, Mode.STATIONARY)
+    yield from look_down(mind)
 
 
 def compute_spot(mind: Mind, height: float) -> np.ndarray:

@@ -16,9 +16,11 @@ from xop_lerobot.transforms import (
     pose_multiply,
     quat_conjugate,
     quat_exp,
+    quat_from_rpy,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
+    quat_to_rpy,
 )
 
 WINDOW = 0.4
@@ -67,7 +69,7 @@ class Perception:
         self._trail: deque[View] = deque()
         self._seen: dict[str, SeenObject] = {}
         self._in_view: set[str] = set()
-        self._rest_reach = 0.0
+        self._rest_reach = self._nod = 0.0
         self._first_look: np.ndarray | None = None
 
     def show(self, view: View) -> None:
@@ -77,8 +79,15 @@ class Perception:
             self._first_look = _measure_hand(view)
         self._queue.append(view)
 
-    def advance(self, time: float) -> None:
-        """Perceive all that has arrived by `time` [s] of the robot's clock."""
+    def advance(self, time: float, nod: float = 0.0) -> None:
+        """Perceive all that has arrived by `time` [s] of the robot's clock.
+
+        Args:
+            time: Now [s].
+            nod: How far the person's head is nodded; the robot's cameras see more than the
+                headset shows, so a person looks down also where the robot does not [rad].
+        """
+        self._nod = nod
         while self._queue and self._queue[0].time <= time - self._person.delay + 1e-9:
             self._perceive(self._queue.popleft())
 
@@ -115,6 +124,14 @@ class Perception:
     def fallen(self) -> bool:
         """Whether the robot has fallen."""
         return self._view.fallen
+
+    def look_over(self) -> None:
+        """Know roughly where everything is, as who looked the scene over before engaging."""
+        for name, thing in self._view.objects.items():
+            if name not in self._seen:
+                blur = 5 * self._person.place_noise * self._rng.standard_normal(3)
+                pose = make_pose(thing.pose[:3] + blur, thing.pose[3:])
+                self._seen[name] = SeenObject(pose, np.array(thing.size))
 
     def recall(self, name: str, default: float) -> float:
         """What a person who has practised the task knows, by name [m]."""
@@ -170,6 +187,8 @@ class Perception:
             drift.advance(dt)
         head = np.asarray(view.frames["head"], dtype=float)
         self._in_view = set()
+        pitch = float(quat_to_rpy(head[3:])[1])
+        self._gaze = quat_multiply(head[3:], quat_from_rpy(0, max(self._nod - pitch, 0.0), 0))
         error = self._get_drift("head").value
         head_seen = make_pose(
             head[:3] + self._person.place_noise * error[:3],
@@ -183,8 +202,7 @@ class Perception:
             self._look_at(name, thing, head, dt)
 
     def _look_at(self, name: str, thing: SeenObject, head: np.ndarray, dt: float) -> None:
-        offset = quat_rotate(quat_conjugate(head[3:]), thing.pose[:3] - head[:3])
-        # The hands are felt as well as seen: one knows where one's own hands are.
+        offset = quat_rotate(quat_conjugate(self._gaze), thing.pose[:3] - head[:3])
         if not self._is_in_view(offset, float(np.max(thing.size))):
             return
         self._in_view.add(name)
@@ -195,7 +213,7 @@ class Perception:
         blur = person.place_noise * error[:3] + distance * (
             person.depth_noise * along + person.side_noise * (error[:3] - along)
         )
-        seen = head[:3] + quat_rotate(head[3:], (1 + self._bias) * offset + blur)
+        seen = head[:3] + quat_rotate(self._gaze, (1 + self._bias) * offset + blur)
         quat = quat_multiply(quat_exp(TURN_NOISE * error[3:]), thing.pose[3:])
         self._note(name, SeenObject(make_pose(seen, quat), np.array(thing.size)), dt)
 

@@ -58,7 +58,7 @@ class Person:
     display_delay: float = 0.135
     visual_delay: float = 0.11
     decision_s: float = 0.25
-    view_half_angles: tuple[float, float] = (0.96, 0.75)
+    view_half_angles: tuple[float, float] = (0.96, 0.84)
     depth_bias: float = 0.03
     depth_noise: float = 0.012
     side_noise: float = 0.004
