@@ -185,9 +185,8 @@ def run(args: argparse.Namespace) -> int:
     results = Results(args.out)
     finished = results.load()
     jobs = plan_jobs(cells, args.out, () if args.fresh else finished)
-    for cell in cells:
-        if cell.absence:
-            print(f"{describe(cell.setup)}: {cell.absence}", file=sys.stderr)
+    for name, why in {cell.setup.low_level: cell.absence for cell in cells if cell.absence}.items():
+        print(f"low-level policy '{name}': {why}", file=sys.stderr)
     interrupted, failed = False, 0
     if jobs and not args.no_run:
         try:
