@@ -12,6 +12,7 @@ from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.devices.simulated import SimulatedDevice
 from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.operator.simulated.body import Body
+from xop_lerobot.operator.simulated.intentions import INTENTIONS
 from xop_lerobot.operator.simulated.perception import Perception
 from xop_lerobot.operator.simulated.person import Person, draw_person
 from xop_lerobot.operator.view import SeenObject, View
@@ -181,6 +182,28 @@ def test_gives_up_and_is_finished() -> None:
     assert device.mind.diary[-1][1] == "gave up: could not change to mobile"
     assert device.is_finished(world.time)
     assert world.mode is Mode.STATIONARY
+
+
+def test_sets_out_to_do_every_task() -> None:
+    from xop_lerobot.tasks import (  # noqa: F401, PLC0415 they register themselves
+        box_pick_and_place,
+        dual_point_touch,
+        non_prehensile_transport,
+    )
+    from xop_lerobot.tasks.task import TASKS  # noqa: PLC0415
+
+    assert set(INTENTIONS) == set(TASKS)
+
+
+def test_nods_to_see_what_is_low() -> None:
+    low = {"box": SeenObject(make_pose(np.array([0.3, 0, 0.75]), UNIT))}
+    eyes = Perception(Person(), np.random.default_rng(0))
+    show(eyes, low, 1.0)
+    assert not eyes.knows("box")
+    for time in np.arange(1.0, 2.0, DT):
+        eyes.show(View(float(time), "", make_body(), low))
+    eyes.advance(2.0, nod=0.4)
+    assert eyes.sees("box")
 
 
 def test_unknown_task_is_named() -> None:
