@@ -1,4 +1,4 @@
-"""`xop-collect`: tasks as LeRobot datasets, with success labels and without anybody there.
+r"""`xop-collect`: tasks as LeRobot datasets, with success labels and without anybody there.
 
     xop-collect --robot g1 --task box_pick_and_place --episodes 50 --seed 0 \
         --root outputs/boxes --repo-id me/boxes
@@ -187,7 +187,7 @@ def make_parser() -> argparse.ArgumentParser:
         parser.add_argument(f"--{name}", help=text, **options)
 
     add("robot", "robot: g1 or rby1", required=True)
-    add("task", "task, such as box_pick_and_place", required=True)
+    add("task", "dual_point_touch, box_pick_and_place or non_prehensile_transport", required=True)
     add("episodes", "how many episodes there shall be", required=True, type=int)
     add("root", "directory of the dataset", required=True, type=Path)
     add("repo-id", "name of the dataset; empty: local/<directory>", default="")
@@ -203,7 +203,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("method", "mpc, mpc_no_sync, mpc_table1, direct or direct_amo")
     add("variant", "binding, constraints and preset with _ between, such as v2_upright")
     add("scene", "scene; empty: the task's own")
-    add("device", "operator device")
+    add("device", "operator device: simulated, or one of a plugin")
     add("plugins", "modules to import first, with commas between", type=_split)
     add("only-successful", "leave episodes without success out", action="store_true")
     add("images", "store pictures as PNG and not as h264 video", action="store_true")

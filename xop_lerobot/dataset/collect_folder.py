@@ -72,6 +72,7 @@ class Attempt:
         frames: Frames.
         run: When the run that made it began [s since the epoch].
         elapsed: Time from then until it was finished [s].
+        cpu_s: Time that processors worked for it [s].
     """
 
     index: int
@@ -81,6 +82,7 @@ class Attempt:
     frames: int
     run: float
     elapsed: float
+    cpu_s: float
 
 
 class CollectFolder:

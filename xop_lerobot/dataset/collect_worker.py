@@ -59,6 +59,7 @@ class Collector:
 
     def collect(self, index: int) -> Attempt:
         """Make episode `index`, and let it count."""
+        cpu = time.process_time()
         folder = self.folder.open_attempt(index)
         teleop: Xop = make_device_from_device_class(self.config.make_teleop_config())
         # LeRobot's own loop is not used here, so it needs no help.
@@ -80,7 +81,16 @@ class Collector:
         finally:
             teleop.disconnect()
         failure = "" if success else str(getattr(outcome, "failure", ""))
-        attempt = Attempt(index, success, failure, kept, frames, self.run, time.time() - self.run)
+        attempt = Attempt(
+            index,
+            success,
+            failure,
+            kept,
+            frames,
+            run=self.run,
+            elapsed=time.time() - self.run,
+            cpu_s=time.process_time() - cpu,
+        )
         self.folder.close_attempt(folder, attempt)
         return attempt
 
