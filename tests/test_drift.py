@@ -141,3 +141,14 @@ def test_turning_about_a_pivot_ahead_of_the_base_is_no_drift():
     observer = DriftObserver(model)
     walk(observer, model, command_of(model, yaw_rate=1.0), np.zeros(3), 20)
     np.testing.assert_allclose(observer.drift, 0, atol=0.02)
+
+
+def test_wheels_take_a_velocity_up_at_once(g1):
+    """Without a lag a start is no drift either, where the base obeys at once."""
+    observer = DriftObserver(g1, lag_s=0.0)
+    command = command_of(g1, vx=0.5)
+    for tick in range(50):
+        qpos = np.zeros(40)
+        qpos[:4] = tick * DT * 0.5, 0, 0, 1
+        observer.update(tick * DT, qpos, command, moving=True)
+        assert abs(observer.drift[0]) < 1e-9

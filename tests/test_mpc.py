@@ -21,6 +21,7 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
+from xop_lerobot.retarget.horizon_goals import preview
 from xop_lerobot.retarget.intervention import Intervention
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
@@ -379,7 +380,7 @@ def test_the_goal_is_carried_on_at_its_velocity(bench):
     goal = b.make_goal(Mode.MOBILE, (0, 0, 0), velocities={"head": velocity})
     config = b.retargeter.configs[Mode.MOBILE]
     times = np.array([0.0, 0.1, config.preview_s, 5.0])
-    poses = b.retargeter._preview(goal, times, config)["head"]
+    poses = preview(goal, ("head",), times, config.preview_s)["head"]
     start = goal.poses["head"]
     for time, pose in zip(times, poses, strict=True):
         held = min(time, config.preview_s)
@@ -435,7 +436,7 @@ def test_a_plan_goes_on_where_the_last_one_was(many_knots):
 
 
 def test_a_goal_that_runs_away_is_held_near(bench):
-    b = bench("rby1")
+    b = bench("g1")
     reach = b.retargeter.configs[Mode.MOBILE].reach
     commands = []
     for distance in (reach + 0.01, 50.0):

@@ -96,6 +96,8 @@ class Morphology(ABC):
     """What each entry of the command does, in the order of `command_space`."""
     contact_groups: tuple[tuple[str, ...], ...]
     """`contact_points` that touch the ground together: a foot, a wheel."""
+    velocity_lag_s: float = 0.3
+    """Time constant with which the base takes up a velocity; wheels have none [s]."""
     pivot: float = 0.0
     """Forward distance from the base's frame to its centre of turning [m]."""
     support: tuple[tuple[float, float], ...] = ()

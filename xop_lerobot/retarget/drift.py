@@ -25,7 +25,7 @@ class DriftObserver:
     Args:
         command_model: What a command asks of the base.
         time_constant: τ [s], several strides.
-        lag_s: Time constant with which the base takes a command up [s].
+        lag_s: Time constant with which the base takes a command up; may be 0 [s].
     """
 
     def __init__(
@@ -69,7 +69,8 @@ class DriftObserver:
             [cosine * moved[0] + sine * moved[1], cosine * moved[1] - sine * moved[0], moved[2]]
         )
         twist = self.command_model.compute_twist(command)
-        self._expected += -np.expm1(-dt / self.lag_s) * (twist - self._expected)
+        taken_up = -np.expm1(-dt / self.lag_s) if self.lag_s > 0 else 1.0
+        self._expected += taken_up * (twist - self._expected)
         excess = velocity / dt - self._expected
         gain = -np.expm1(-dt / self.time_constant)
         self.drift = np.clip(self.drift + gain * (excess - self.drift), -_MAX, _MAX)

@@ -22,8 +22,8 @@ from xop_lerobot.retarget.costs import CollisionCost, FallCost, SupportArea, mak
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.drift import DriftObserver
-from xop_lerobot.retarget.facing import FacingRule
-from xop_lerobot.retarget.horizon_goals import hold_level, hold_near, preview
+from xop_lerobot.retarget.guidance import Guidance
+from xop_lerobot.retarget.horizon_goals import hold_level
 from xop_lerobot.retarget.intervention import Verdict, judge
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.offset import OffsetObserver
@@ -69,7 +69,7 @@ class MpcRetargeter(Retargeter):
         self.command_model = CommandModel(
             model, self.space, self.decision.effects, morphology.pivot
         )
-        self.drift = DriftObserver(self.command_model)
+        self.drift = DriftObserver(self.command_model, lag_s=morphology.velocity_lag_s)
         self.offset = OffsetObserver(self.command_model)
         hull = morphology.hull_points
         self._collision = CollisionCost(
@@ -82,9 +82,8 @@ class MpcRetargeter(Retargeter):
             resting = self.readings.compute_com(morphology.standing_qpos())
             self.support = SupportArea(morphology.support, tuple(resting[:2]))
         standing = self.readings.compute_poses(morphology.standing_qpos(), morphology.frames)
-        self._facing = FacingRule(
-            morphology, {name: float(pose[0]) for name, pose in standing.items()}
-        )
+        resting = {name: float(pose[0]) for name, pose in standing.items()}
+        self._guidance = Guidance(morphology, self.command_model, resting)
         self.candidates = Candidates(
             morphology,
             self.rollout.model,
@@ -219,13 +218,9 @@ class MpcRetargeter(Retargeter):
         self.offset.update(state.time, state.qpos, executed, learns=observes)
         drift = self.drift.drift
         poses = self.readings.compute_poses(state.qpos, self.sites)
-        goal = hold_near(goal, poses, config.reach)
         goal = hold_level(goal, self._find_upright())
-        goals = self._preview(goal, _compute_times(config), config)
-        then = {name: poses[-1:] for name, poses in goals.items()}
-        facing = np.zeros(2)
-        if self.command_model.is_nonholonomic and mode is Mode.MOBILE:
-            facing = self._facing.compute(state.qpos, poses, then, config.proposal_s)
+        goals, facing = self._guidance.lead(state.qpos, executed, poses, goal, config)
+        then = {name: track[-1:] for name, track in goals.items()}
         proposal = self.candidates.propose(
             state,
             then,
@@ -307,11 +302,6 @@ class MpcRetargeter(Retargeter):
             planner.reset(executed)
         else:
             planner.shift(max(0.0, time - self._last[0]) / POLICY_DT)
-
-    def _preview(
-        self, goal: Goal, ahead: float | np.ndarray, config: MpcConfig
-    ) -> dict[str, np.ndarray]:
-        return preview(goal, self.frames, np.atleast_1d(ahead), config.preview_s)
 
     def _predict(self, state: RobotState, decisions: np.ndarray, mode: Mode) -> Prediction:
         """Roll decisions out. Shape (K, H, n)."""
@@ -401,16 +391,6 @@ def _finite(value: float) -> float:
     return float(value) if math.isfinite(value) else 0.0
 
 
-def _compute_times(config: MpcConfig) -> np.ndarray:
-    """Times at which goals are asked for [s]: the control steps, and two further ones.
-
-    Those are the end of the extrapolation, and what the proposal aims at. Shape (H + 3,).
-    """
-    end = config.horizon * POLICY_DT
-    steps = np.arange(config.horizon + 1) * POLICY_DT
-    return np.append(steps, [end + config.extrapolation_s, config.proposal_s])
-
-
 def _compute_noise_share(
     poses: Mapping[str, np.ndarray], goals: Mapping[str, np.ndarray], config: MpcConfig
 ) -> float:
@@ -418,7 +398,7 @@ def _compute_noise_share(
 
     Args:
         poses: Tracked frames now. Shapes (7,).
-        goals: Their goals at `_compute_times`. Shapes (H + 3, 7).
+        goals: Their goals at `compute_times`. Shapes (H + 3, 7).
         config: Parameters of the mode.
     """
     error = 0.0

@@ -115,6 +115,7 @@ class RBY1(Morphology):
         ),
     }
     effects = EFFECTS
+    velocity_lag_s = 0.0
     pivot = PIVOT
     support = SUPPORT
     hull_points = HULL

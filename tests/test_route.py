@@ -1,0 +1,189 @@
+"""The way of a base on wheels to a goal: it arrives, within its limits, and goes on as planned."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from xop_lerobot.command import Mode
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.retarget.guidance import Guidance, compute_times
+from xop_lerobot.retarget.mpc import MpcRetargeter
+from xop_lerobot.retarget.route import RoutePlanner
+from xop_lerobot.state import Goal
+from xop_lerobot.transforms import make_pose, pose_multiply, quat_from_yaw, quat_yaw
+
+RESTING = 0.03  # how far the head is ahead of the base [m]
+LEAN = 0.1  # what is left to the torso [m]
+
+
+@pytest.fixture(scope="module")
+def rby1():
+    return make_morphology("rby1")
+
+
+@pytest.fixture(scope="module")
+def planner(rby1):
+    return RoutePlanner(rby1, {"head": RESTING, "left_wrist": 0.3})
+
+
+def place(rby1, x=0.0, y=0.0, yaw=0.0):
+    """Configuration, and pose of the resting head, of a base somewhere."""
+    world = make_pose([x, y, 0], quat_from_yaw(yaw))
+    qpos = rby1.standing_qpos()
+    qpos[:7] = pose_multiply(world, qpos[:7])
+    return qpos, pose_multiply(world, make_pose([RESTING, 0, 1.4], quat_from_yaw(0)))
+
+
+def go(planner, rby1, goal, speeds=(0.0, 0.0), duration=8.0, **start):
+    qpos, head = place(rby1, **start)
+    return planner.plan(qpos, speeds, "head", head, goal, duration)
+
+
+def make_goal(x, y, yaw=0.0):
+    return make_pose([x + RESTING, y, 1.4], quat_from_yaw(yaw))
+
+
+@pytest.mark.parametrize(
+    "x, y, yaw",
+    [(2, 0, 0), (0.8, 0.3, 0.4), (0, 1, 0), (0, -1, 0), (-0.6, 0, 0), (-1, -1, 2.5), (1, 1, -1.5)],
+)
+def test_it_arrives_and_stays(planner, rby1, x, y, yaw):
+    route = go(planner, rby1, make_goal(x, y, yaw))
+    far = np.hypot(*route.offsets.T)
+    arrived = route.times[np.argmax(far == 0)]
+    assert far[0] == pytest.approx(math.hypot(x, y) - LEAN)
+    assert 0 < arrived < 2 + 2 * math.hypot(x, y)
+    assert not far[route.times > arrived + 2].any()
+    # The waist can turn to where the goal looks.
+    assert abs(math.remainder(route.headings[-1] - yaw, math.tau)) < 1.95
+    assert abs(route.headings[-1] - route.headings[-25]) < 0.02
+
+
+def test_forwards_backwards_and_in_place(planner, rby1):
+    """Straight ways need no turn, and what the torso reaches needs no way."""
+    assert not go(planner, rby1, make_goal(2, 0)).headings.any()
+    assert not go(planner, rby1, make_goal(-1, 0)).headings.any()
+    still = go(planner, rby1, make_goal(0.05, 0.05))
+    assert not still.offsets.any()
+    assert still.share == 0
+    assert np.abs(still.headings).max() < 0.01
+
+
+def test_the_limits_of_a_tall_robot_hold(planner, rby1):
+    """Speed, yaw rate, their changes, and their product: the acceleration across the heading."""
+    for x, y in ((2, 0.5), (0, 1.5), (-1, 1), (1.5, -1.5)):
+        route = go(planner, rby1, make_goal(x, y), duration=6.0)
+        step = np.diff(route.times)[0]
+        turn = np.diff(route.headings) / step
+        assert np.abs(turn).max() < 1.41
+        assert np.abs(np.diff(turn)).max() < 3.01 * step
+
+
+def test_a_way_computed_anew_goes_on_as_before(planner, rby1):
+    """From a state on the way the rest of the way is the same: nothing flickers."""
+    goal = make_goal(0.5, 1.2, 0.3)
+    whole = go(planner, rby1, goal, duration=4.0)
+    # Drive the law by hand for half a second, with the planner's own step.
+    x, y, yaw, v, w = rby1.pivot, 0.0, 0.0, 0.0, 0.0
+    from xop_lerobot.retarget.route import _Aim, _clamp, _steer
+
+    aim = _Aim(goal[0], goal[1], 0.3, 1.9, (RESTING - rby1.pivot, 0.0))
+    for _ in range(12):
+        wanted = _steer(aim, x, y, yaw)
+        v += _clamp(wanted[0] - v, 1.5 * 0.04)
+        w += _clamp(wanted[1] - w, 3.0 * 0.04)
+        middle = yaw + w * 0.02
+        x, y, yaw = x + v * 0.04 * math.cos(middle), y + v * 0.04 * math.sin(middle), yaw + w * 0.04
+    base = (x - rby1.pivot * math.cos(yaw), y - rby1.pivot * math.sin(yaw))
+    rest = go(planner, rby1, goal, speeds=(v, w), duration=3.0, x=base[0], y=base[1], yaw=yaw)
+    np.testing.assert_allclose(
+        rest.headings, whole.headings[12 : 12 + len(rest.headings)], atol=1e-9
+    )
+    np.testing.assert_allclose(rest.offsets, whole.offsets[12 : 12 + len(rest.offsets)], atol=1e-9)
+
+
+def test_where_the_world_lies_does_not_matter(planner, rby1):
+    route = go(planner, rby1, make_goal(0.4, 1.0, 0.5))
+    world = make_pose([3, -2, 0], quat_from_yaw(2.0))
+    goal = pose_multiply(world, make_goal(0.4, 1.0, 0.5))
+    turned = go(planner, rby1, goal, x=3, y=-2, yaw=2.0)
+    np.testing.assert_allclose(turned.headings - 2.0, route.headings, atol=1e-9)
+    assert np.hypot(*turned.offsets.T) == pytest.approx(np.hypot(*route.offsets.T))
+
+
+def test_a_hand_has_the_base_arrive_as_it_faces(planner, rby1):
+    """A wrist looks nowhere: after the way the base faces as before."""
+    qpos, _ = place(rby1)
+    hand = make_pose([0.5, 0.3, 1.0], quat_from_yaw(1.0))
+    goal = make_pose([0.5, 1.3, 1.0], quat_from_yaw(-1.0))
+    route = planner.plan(qpos, (0.0, 0.0), "left_wrist", hand, goal, 12.0)
+    assert not route.offsets[-25:].any()
+    assert abs(route.headings[-1]) < 0.3
+
+
+def test_offsets_and_facing_at_a_time(planner, rby1):
+    route = go(planner, rby1, make_goal(0, 1))
+    np.testing.assert_allclose(route.offsets_at(np.array([0.0, 99.0]))[0], [0, -0.9], atol=0.01)
+    np.testing.assert_allclose(route.offsets_at(np.array([0.0, 99.0]))[1], 0)
+    x, y = route.facing_at(1.0)
+    assert math.hypot(x, y) == pytest.approx(1)
+    assert abs(math.atan2(y, x)) > 0.5
+
+
+def make_retargeter(bench_robot):
+    from xop_lerobot.low_level.policy import make_policy
+    from xop_lerobot.morphology.scene import build_model
+
+    policy = make_policy(bench_robot.policies[0], None)
+    return MpcRetargeter(bench_robot, policy, build_model(bench_robot, "planning"))
+
+
+@pytest.mark.parametrize("name, led", [("rby1", True), ("g1", False)])
+def test_who_is_led_along_a_way(name, led):
+    """Wheels in mobile mode, to goals that stand; legs and moving goals keep theirs in reach."""
+    robot = make_morphology(name)
+    retargeter = make_retargeter(robot)
+    guidance: Guidance = retargeter._guidance
+    qpos = robot.standing_qpos()
+    head = retargeter.readings.compute_poses(qpos, retargeter.sites)["head"]
+    target = head + [0, 1, 0, 0, 0, 0, 0]
+    config = retargeter.configs[Mode.MOBILE]
+    executed = retargeter.space.neutral
+
+    def lead(goal):
+        return guidance.lead(qpos, executed, {"head": head}, goal, config)
+
+    goals, facing = lead(Goal({"head": target}, mode=Mode.MOBILE))
+    assert goals["head"].shape == (len(compute_times(config)), 7)
+    # A way begins where the head is, less what the torso reaches.
+    assert (goals["head"][0, 1] - head[1] < LEAN + 0.01) == led
+    assert bool(facing.any()) == led
+    moving, _ = lead(Goal({"head": target}, {"head": np.array([0.5, 0, 0, 0, 0, 0])}, Mode.MOBILE))
+    assert moving["head"][0, 1] - head[1] == pytest.approx(config.reach, abs=0.01)
+    standing, facing = lead(Goal({"head": target}, mode=Mode.STATIONARY))
+    assert not facing.any()
+    assert quat_yaw(standing["head"][0, 3:]) == pytest.approx(quat_yaw(head[3:]))
+    retargeter.close()
+
+
+def test_a_base_that_may_not_be_moved_has_no_way():
+    """Where an arm alone is free (variant V2), the goal stays the goal."""
+    robot = make_morphology("rby1")
+    retargeter = make_retargeter(robot)
+    retargeter.configure(targets=("left_wrist",), body=robot.variants["v2"].body)
+    qpos = robot.standing_qpos()
+    hand = retargeter.readings.compute_poses(qpos, retargeter.sites)["left_wrist"]
+    target = hand + [0, 0.3, 0, 0, 0, 0, 0]
+    goals, facing = retargeter._guidance.lead(
+        qpos,
+        retargeter.space.neutral,
+        {"left_wrist": hand},
+        Goal({"left_wrist": target}, mode=Mode.MOBILE),
+        retargeter.configs[Mode.MOBILE],
+    )
+    np.testing.assert_allclose(goals["left_wrist"][:, 1], target[1])
+    assert not facing.any()
+    retargeter.close()

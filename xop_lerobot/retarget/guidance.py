@@ -1,0 +1,124 @@
+"""What the controller is led along: the goals over the horizon, and where wheels shall face."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.low_level.policy import POLICY_DT
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.retarget.facing import FacingRule
+from xop_lerobot.retarget.horizon_goals import hold_near, preview
+from xop_lerobot.retarget.route import RoutePlanner
+from xop_lerobot.state import Goal
+
+_STILL = 0.2  # speed of a goal under which it counts as standing still [m/s]
+
+
+class Guidance:
+    """Turns the goal of now into goals over the horizon.
+
+    A goal that stands still is led along the way that a base on wheels takes to it (`Route`).
+    One that moves is followed within reach, the base facing where it goes (`FacingRule`): a way
+    that ends at the goal would always be late. A robot that can go sideways, or that does not
+    drive, has its goals within reach and nothing more.
+
+    Args:
+        morphology: The robot.
+        command_model: What is decided; says whether the base drives but cannot go sideways.
+        resting: How far ahead of the base each tracked frame is at rest [m].
+    """
+
+    def __init__(
+        self, morphology: Morphology, command_model: CommandModel, resting: Mapping[str, float]
+    ) -> None:
+        self._command_model = command_model
+        self._facing = FacingRule(morphology, resting)
+        self._routes = RoutePlanner(morphology, resting)
+
+    def lead(
+        self,
+        qpos: np.ndarray,
+        executed: np.ndarray,
+        poses: Mapping[str, np.ndarray],
+        goal: Goal,
+        config: MpcConfig,
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Compute the goals at `compute_times`, and where a base on wheels shall face at the end.
+
+        Args:
+            qpos: Configuration now. Shape (nq,).
+            executed: Decision being executed. Shape (n,).
+            poses: Pose of each tracked frame now. Shapes (7,).
+            goal: The goal now.
+            config: Parameters of the mode.
+
+        Returns:
+            Poses, shapes (H + 3, 7), and a direction in the world, as long as it counts: zero
+            where none does. Shape (2,).
+        """
+        times = compute_times(config)
+        name = next((name for name in poses if name in goal.poses), None)
+        drives = name is not None and self._drives(goal.mode)
+        if drives and _compute_speed(goal, name) < _STILL:
+            twist = self._command_model.compute_twist(executed)
+            return self._lead_along_route(qpos, twist, poses, goal, name, times, config)
+        near = hold_near(goal, poses, config.reach)
+        goals = preview(near, tuple(poses), times, config.preview_s)
+        if not drives:
+            return goals, np.zeros(2)
+        then = {each: track[-1:] for each, track in goals.items()}
+        return goals, self._facing.compute(qpos, poses, then, config.proposal_s)
+
+    def _drives(self, mode: Mode) -> bool:
+        """Whether wheels are among what may be moved in `mode`."""
+        free = self._command_model.acting(mode).astype(float)
+        return (
+            self._command_model.is_nonholonomic and self._command_model.compute_twist(free)[0] > 0
+        )
+
+    def _lead_along_route(
+        self,
+        qpos: np.ndarray,
+        twist: np.ndarray,
+        poses: Mapping[str, np.ndarray],
+        goal: Goal,
+        name: str,
+        times: np.ndarray,
+        config: MpcConfig,
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Goals where the base will have carried the frame `name`; the others go with it."""
+        route = self._routes.plan(
+            qpos,
+            (float(twist[0]), float(twist[2])),
+            name,
+            poses[name],
+            goal.poses[name],
+            duration=float(times[-2:].max()),
+        )
+        offsets = np.zeros((len(times), 7))
+        offsets[:, :2] = route.offsets_at(times)
+        goals = preview(goal, tuple(poses), times, config.preview_s)
+        led = {each: track + offsets for each, track in goals.items()}
+        return led, route.facing_at(float(times[-2]))
+
+
+def compute_times(config: MpcConfig) -> np.ndarray:
+    """Times at which goals are asked for [s]: the control steps, and two further ones.
+
+    Those are the end of the extrapolation, and what the proposal aims at. Shape (H + 3,).
+    """
+    end = config.horizon * POLICY_DT
+    steps = np.arange(config.horizon + 1) * POLICY_DT
+    return np.append(steps, [end + config.extrapolation_s, config.proposal_s])
+
+
+def _compute_speed(goal: Goal, name: str) -> float:
+    """Horizontal speed of a goal [m/s]."""
+    velocity = goal.velocities.get(name)
+    return 0.0 if velocity is None else math.hypot(velocity[0], velocity[1])

@@ -1,0 +1,198 @@
+"""The way of a base that cannot go sideways to a goal that stands still: turn, drive, arrive."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.transforms import quat_yaw
+
+_DT = 0.04  # step of the simulated way [s]
+_MAX_SPEED, _ACCELERATION, _BRAKING = 1.2, 1.5, 1.0  # [m/s], [m/s²], [m/s²]
+_MAX_TURN, _TURN_ACCELERATION, _TURN_BRAKING = 1.4, 3.0, 2.0  # [rad/s], [rad/s²], [rad/s²]
+_CENTRIPETAL = 0.6  # largest acceleration across the heading: a tall robot tips over [m/s²]
+_FINE = 6.0  # gain of the last centimetres and degrees, where the braking law is too steep [1/s]
+_FINE_DRIVE, _FINE_TURN = 0.05, 0.1  # within which that gain holds [m], [rad]
+_BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
+_TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
+_MAX_TWIST = 1.9  # largest twist of the waist in which the robot arrives [rad]
+_CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
+_LINE_UP = 0.2  # distance of the place at which its heading counts like the way to it [m]
+_LEAN = 0.1  # distance that the torso bridges by itself [m]
+_ITERATIONS = 4  # place and heading of the arrival depend on each other
+
+
+@dataclass(frozen=True)
+class Route:
+    """Where a base will have carried what is tracked, beside its goal.
+
+    Attributes:
+        times: Times from now [s]. Shape (n,).
+        offsets: Where it is carried, less the goal, by more than the torso bridges [m].
+            Shape (n, 2).
+        headings: Heading of the base, not wrapped [rad]. Shape (n,).
+        share: How much that heading counts, from 0 at the goal to 1 away from it.
+    """
+
+    times: np.ndarray
+    offsets: np.ndarray
+    headings: np.ndarray
+    share: float
+
+    def offsets_at(self, ahead: np.ndarray) -> np.ndarray:
+        """Offsets from the goal at times from now [s], the outermost beyond. (n,) -> (n, 2)."""
+        columns = [np.interp(ahead, self.times, column) for column in self.offsets.T]
+        return np.stack(columns, axis=-1)
+
+    def facing_at(self, ahead: float) -> np.ndarray:
+        """Direction of the base in `ahead` [s], as long as it counts. Shape (2,)."""
+        heading = float(np.interp(ahead, self.times, self.headings))
+        return self.share * np.array([math.cos(heading), math.sin(heading)])
+
+
+class _Aim(NamedTuple):
+    """What is to be carried where: goal x, y, where it looks, and how it sits on the axle."""
+
+    x: float
+    y: float
+    look: float
+    twist: float
+    carried: tuple[float, float]
+
+    def clip(self, heading: float) -> float:
+        """The heading nearest to `heading` in which the base may arrive [rad]."""
+        return self.look + min(max(_wrap(heading - self.look), -self.twist), self.twist)
+
+    def find_way(self, x: float, y: float, heading: float) -> tuple[float, float]:
+        """From the axle at x, y to its place under the goal, arriving in `heading` [m]."""
+        ahead, aside = _rotate(*self.carried, heading)
+        return self.x - ahead - x, self.y - aside - y
+
+
+class RoutePlanner:
+    r"""Simulates how a base with two wheels drives to its goal as fast as its limits allow.
+
+    The axle's place p* depends on the heading ψ* in which the base arrives; a waist that turns
+    leaves that free by `_MAX_TWIST` on either side of where the goal looks, so that the base
+    mostly need not turn again once it is there. It turns towards :math:`\pm(p^* - p)`, forwards
+    or backwards, whatever costs less of a turn and of a twist, by the braking law
+    :math:`\omega = \sqrt{2\alpha|e|}`, and drives by the same law as far as it faces its way,
+    :math:`v = \cos^4 e\,\sqrt{2 b d}`. Both depend on the present state alone, so that a way
+    that is computed anew goes on as before.
+
+    Far from its goal a robot on wheels does better to turn away from it first. No horizon of a
+    third of a second shows that: the way is what its goals are led along.
+
+    Args:
+        morphology: The robot.
+        resting: How far ahead of the base each tracked frame is at rest [m].
+
+    References:
+        Siciliano et al., Robotics, 2009, section 11.5 (limits of feedback to a point for a
+        unicycle) and 11.6 (regulation of the posture by turning and driving).
+    """
+
+    def __init__(self, morphology: Morphology, resting: Mapping[str, float]) -> None:
+        self._pivot, self._resting = morphology.pivot, dict(resting)
+        self._hands = {arm.frame for arm in morphology.arms}
+
+    def plan(
+        self,
+        qpos: np.ndarray,
+        speeds: tuple[float, float],
+        name: str,
+        pose: np.ndarray,
+        goal: np.ndarray,
+        duration: float,
+    ) -> Route:
+        """Simulate the way.
+
+        Args:
+            qpos: Configuration now. Shape (nq,).
+            speeds: Speed and yaw rate being commanded now [m/s], [rad/s].
+            name: The tracked frame; a hand looks nowhere: the base then arrives as it faces now.
+            pose: Pose of the frame now. Shape (7,).
+            goal: Its goal, which stands still. Shape (7,).
+            duration: Length of the way to look at [s].
+        """
+        heading = float(quat_yaw(qpos[3:7]))
+        x = float(qpos[0]) + self._pivot * math.cos(heading)
+        y = float(qpos[1]) + self._pivot * math.sin(heading)
+        gx, gy = float(goal[0]), float(goal[1])
+        if name in self._hands:
+            carried = _rotate(float(pose[0]) - x, float(pose[1]) - y, -heading)
+            aim = _Aim(gx, gy, heading, 0.0, carried)
+        else:
+            carried = (self._resting[name] - self._pivot, 0.0)
+            aim = _Aim(gx, gy, float(quat_yaw(goal[3:])), _MAX_TWIST, carried)
+        v, w = speeds
+        count = math.ceil(duration / _DT) + 1
+        offsets, headings = np.empty((count, 2)), np.empty(count)
+        for i in range(count):
+            ahead, aside = _rotate(*carried, heading)
+            offsets[i] = x + ahead - gx, y + aside - gy
+            headings[i] = heading
+            wanted_v, wanted_w = _steer(aim, x, y, heading)
+            v += _clamp(wanted_v - v, _ACCELERATION * _DT)
+            w += _clamp(wanted_w - w, _TURN_ACCELERATION * _DT)
+            dx, dy = _rotate(v * _DT, 0.0, heading + w * _DT / 2)
+            x, y, heading = x + dx, y + dy, heading + w * _DT
+        far = np.hypot(offsets[:, 0], offsets[:, 1])
+        offsets *= np.maximum(0.0, 1 - _LEAN / np.maximum(far, _LEAN))[:, None]
+        share = min(max(float(far[0]) / _LEAN - 1.0, 0.0), 1.0)
+        return Route(np.arange(count) * _DT, offsets, headings, share)
+
+
+def _steer(aim: _Aim, x: float, y: float, heading: float) -> tuple[float, float]:
+    """Speed and yaw rate that are wanted of the axle at x, y [m/s], [rad/s]."""
+    end = aim.clip(heading)
+    dx, dy = aim.find_way(x, y, end)
+    turn = _wrap(end - heading)
+    if math.hypot(dx, dy) >= _CLOSE:
+        turn, dx, dy = min(
+            (_face(aim, x, y, heading, sign) for sign in (1.0, -1.0)), key=lambda way: way[0]
+        )[1:]
+    along = dx * math.cos(heading) + dy * math.sin(heading)
+    v = _brake(along, _BRAKING, _FINE_DRIVE) * max(0.0, math.cos(turn)) ** 4
+    w = _clamp(_brake(turn, _TURN_BRAKING, _FINE_TURN), _MAX_TURN)
+    return _clamp(v, min(_MAX_SPEED, _CENTRIPETAL / max(abs(w), 1e-6))), w
+
+
+def _face(
+    aim: _Aim, x: float, y: float, heading: float, sign: float
+) -> tuple[float, float, float, float]:
+    """Effort of driving forwards (1) or backwards (-1), the turn before, and the way [m]."""
+    facing = heading
+    for _ in range(_ITERATIONS):
+        end = aim.clip(facing)
+        dx, dy = aim.find_way(x, y, end)
+        ahead, aside = _rotate(_LINE_UP, 0.0, end)
+        facing = math.atan2(sign * dy + aside, sign * dx + ahead)
+    turn = _wrap(facing - heading)
+    effort = abs(turn) + abs(_wrap(end - facing)) + _TWIST * abs(_wrap(end - aim.look))
+    return effort + (_BACKWARDS if sign < 0 else 0.0), turn, dx, dy
+
+
+def _brake(distance: float, deceleration: float, fine: float) -> float:
+    """The largest speed from which `distance` is enough to stop, gentle at its end."""
+    if abs(distance) < fine:
+        return _FINE * distance
+    return math.copysign(math.sqrt(2 * deceleration * abs(distance)), distance)
+
+
+def _clamp(value: float, largest: float) -> float:
+    return min(max(value, -largest), largest)
+
+
+def _rotate(x: float, y: float, angle: float) -> tuple[float, float]:
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return cosine * x - sine * y, sine * x + cosine * y
+
+
+def _wrap(angle: float) -> float:
+    return math.atan2(math.sin(angle), math.cos(angle))
