@@ -84,7 +84,7 @@ class SimulatedDevice(Device):
         if self._doing is None:
             self._doing = self._act(self._task)
         self.mind.body.advance(clock)
-        self.mind.eyes.advance(time, float(self.mind.body.posture.look[1]))
+        self.mind.look(time)
         if self._over_at is None and next(self._doing, self) is self:
             self._over_at = clock
         return self.mind.make_frame(clock)

@@ -42,6 +42,8 @@ CLOSE_SPEED = 0.045
 """Mean speed of closing hands [m/s]."""
 BEHIND = 0.015
 """A palm that far behind the own hand is stopped [m]."""
+PRESSES = 4
+"""How often the person presses on, while the palms still give way."""
 ROBOT_LAG = 0.35
 """How much later than oneself a robot is known to move [s]."""
 PRESS = 0.03
@@ -242,14 +244,22 @@ def close(mind: Mind, press: float) -> Doing:
                 break
         else:
             break
-    mind.note(f"press by {100 * press:.0f} cm")
-    room = mind.body.compute_hands_in_room()
-    ends = {
-        side: make_pose(room[i][:3] + press * own[side], room[i][3:])
-        for i, side in enumerate(SIDES)
-    }
-    yield from move_hands(mind, ends, slowness=2.0)
-    yield from mind.settle("left_palm", "right_palm")
+    for _ in range(PRESSES):
+        # From where the palms are seen, which is where the box stops them.
+        came = {s: float((mind.feel(f"{s}_palm")[:3] - start[s]) @ inwards[s]) for s in SIDES}
+        mind.note(f"press by {100 * press:.0f} cm")
+        room = mind.body.compute_hands_in_room()
+        ends = {
+            side: make_pose(first[i][:3] + (came[side] + press) * own[side], room[i][3:])
+            for i, side in enumerate(SIDES)
+        }
+        yield from move_hands(mind, ends, slowness=2.0)
+        yield from mind.settle("left_palm", "right_palm")
+        if all(
+            float((mind.feel(f"{s}_palm")[:3] - start[s]) @ inwards[s]) - came[s] < 0.5 * press
+            for s in SIDES
+        ):
+            return
 
 
 def _is_stopped(

@@ -8,6 +8,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.operator.simulated.belief import Belief
 from xop_lerobot.operator.simulated.body import SIDES, Body
@@ -44,6 +45,9 @@ class Mind:
         self.body = Body(self.person, HumanNoise(int(sway.generate_state(1)[0]), noise))
         self.rng = np.random.default_rng(hand)
         self._belief: Belief | None = None
+        self.follows_head = True
+        """Whether the person takes the robot's head for the own; not where the hand alone counts,
+        and the rest of the body may do as it likes."""
         self.diary: list[tuple[float, str]] = []
         """What the person did and when, in words; for people who look on."""
 
@@ -80,6 +84,13 @@ class Mind:
     def see(self, view: View) -> None:
         """Be shown a view."""
         self.eyes.show(view)
+
+    def look(self, time: float) -> None:
+        """Perceive what has arrived by `time` [s] of the robot's clock."""
+        heading = None
+        if self._belief is not None:
+            heading = self._belief.turn + compute_heading(self.body.compute_head()[3:])
+        self.eyes.advance(time, float(self.body.posture.look[1]), heading)
 
     def note(self, text: str) -> None:
         """Write down what is being done."""
@@ -123,4 +134,9 @@ class Mind:
         while self.time < limit and not self.is_still(*watched):
             yield
         yield from self.pause(self.person.decision_s)
+        if self.follows_head:
+            self.learn()
+
+    def learn(self) -> None:
+        """Take in where the robot's head is seen to be for the own one."""
         self.belief.learn(self.body.compute_head(), self.eyes.pose("head"), self.person.gain)

@@ -53,6 +53,8 @@ def carry_toy(mind: Mind) -> Doing:
     while mind.eyes.is_blind:
         yield
     mind.eyes.look_over()
+    mind.learn()
+    mind.follows_head = False
     yield from look_down(mind)
     yield from mind.pause(WAIT_S)
     yield from walk_up(mind)
@@ -88,8 +90,7 @@ def compute_axes(mind: Mind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Middle of the opening, and the directions ahead and left of who faces it. Shapes (3,)."""
     opening = mind.eyes.pose("opening")
     heading = float(quat_yaw(opening[3:])) + np.pi / 2
-    head = mind.eyes.pose("head")
-    course = compute_heading(head[3:])
+    course = mind.belief.turn + float(mind.body.posture.place[2])
     if abs(float(wrap_angle(heading - course))) > np.pi / 2:
         heading += np.pi
     ahead = np.array([np.cos(heading), np.sin(heading), 0])
@@ -110,8 +111,10 @@ def walk_up(mind: Mind) -> Doing:
     miss, _ = compute_miss(mind, place)
     if miss < mind.person.place_tolerance + 0.1:
         return
+    mind.follows_head = True
     yield from set_mode(mind, Mode.MOBILE)
     yield from go_to(mind, place, hands=mind.body.posture.hands)
+    mind.follows_head = False
     yield from set_mode(mind, Mode.STATIONARY)
     yield from look_down(mind)
 

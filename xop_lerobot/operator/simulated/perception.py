@@ -21,6 +21,7 @@ from xop_lerobot.transforms import (
     quat_multiply,
     quat_rotate,
     quat_to_rpy,
+    wrap_angle,
 )
 
 WINDOW = 0.4
@@ -29,6 +30,8 @@ SETTLE = 0.3
 """Time over which what is seen is averaged, as long as it stands still [s]."""
 JUMP = 0.06
 """Distance beyond which a thing has moved, and its place is seen anew [m]."""
+WIDE = 0.8
+"""How far aside of the robot's head its cameras let a person look [rad]."""
 TURN_NOISE = 0.02
 """Error of the orientation of what is seen [rad]."""
 HANDS = ("left_wrist", "right_wrist", "left_palm", "right_palm")
@@ -70,6 +73,7 @@ class Perception:
         self._seen: dict[str, SeenObject] = {}
         self._in_view: set[str] = set()
         self._rest_reach = self._nod = 0.0
+        self._heading: float | None = None
         self._first_look: np.ndarray | None = None
 
     def show(self, view: View) -> None:
@@ -79,15 +83,16 @@ class Perception:
             self._first_look = _measure_hand(view)
         self._queue.append(view)
 
-    def advance(self, time: float, nod: float = 0.0) -> None:
+    def advance(self, time: float, nod: float = 0.0, heading: float | None = None) -> None:
         """Perceive all that has arrived by `time` [s] of the robot's clock.
 
         Args:
             time: Now [s].
             nod: How far the person's head is nodded; the robot's cameras see more than the
                 headset shows, so a person looks down also where the robot does not [rad].
+            heading: Where the person looks, in the robot's world [rad]; None is as the robot.
         """
-        self._nod = nod
+        self._nod, self._heading = nod, heading
         while self._queue and self._queue[0].time <= time - self._person.delay + 1e-9:
             self._perceive(self._queue.popleft())
 
@@ -187,8 +192,7 @@ class Perception:
             drift.advance(dt)
         head = np.asarray(view.frames["head"], dtype=float)
         self._in_view = set()
-        pitch = float(quat_to_rpy(head[3:])[1])
-        self._gaze = quat_multiply(head[3:], quat_from_rpy(0, max(self._nod - pitch, 0.0), 0))
+        self._gaze = self._compute_gaze(head[3:])
         error = self._get_drift("head").value
         head_seen = make_pose(
             head[:3] + self._person.place_noise * error[:3],
@@ -200,6 +204,15 @@ class Perception:
                 self._look_at(name, SeenObject(view.frames[name]), head, dt)
         for name, thing in view.objects.items():
             self._look_at(name, thing, head, dt)
+
+    def _compute_gaze(self, head: np.ndarray) -> np.ndarray:
+        """Orientation of the view: the robot's head, turned to where the person looks. (4,)."""
+        down = max(self._nod - float(quat_to_rpy(head)[1]), 0.0)
+        gaze = quat_multiply(head, quat_from_rpy(0, min(down, WIDE), 0))
+        if self._heading is None:
+            return gaze
+        aside = float(wrap_angle(self._heading - compute_heading(head)))
+        return quat_multiply(quat_from_yaw(float(np.clip(aside, -WIDE, WIDE))), gaze)
 
     def _look_at(self, name: str, thing: SeenObject, head: np.ndarray, dt: float) -> None:
         offset = quat_rotate(quat_conjugate(self._gaze), thing.pose[:3] - head[:3])
