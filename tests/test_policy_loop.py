@@ -15,11 +15,17 @@ from hypothesis import strategies as st
 from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.errors import BadShape, BadValue
 from xop_lerobot.low_level.diff_drive import DiffDrive
-from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
+from xop_lerobot.low_level.policy import (
+    POLICY_DT,
+    LowLevelPolicy,
+    PolicyOutput,
+    make_policy,
+)
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.plant.plant import Measurement, Plant
 from xop_lerobot.plant.policy_loop import ARM_MAX_SPEED, PolicyLoop, limit_action
 from xop_lerobot.plant.realtime_loop import RealtimeLoop
+from xop_lerobot.plant.simulation import Simulation
 
 RBY1: Morphology = make_morphology("rby1")
 SPACE = RBY1.command_space
@@ -404,3 +410,27 @@ def test_the_real_policy_takes_what_the_loop_gives():
         loop.execute(ask(v=1.0), 0.04)
     targets = loop.plant.applied[-1]
     assert (targets == -10.0).sum() == 2  # 1 m/s on wheels of 0.1 m
+
+
+@pytest.mark.parametrize(("robot", "ramps"), [("g1", False), ("rby1", True)])
+def test_targets_come_in_a_straight_line_where_the_controller_ramps(robot, ramps):
+    """Over a whole tick of 40 ms, eight physics steps, the left elbow goes by 0.08 rad."""
+    morphology = make_morphology(robot)
+    plant = Simulation(morphology)
+    loop = PolicyLoop(morphology, plant, make_policy(morphology.policies[0]))
+    loop.reset(0, settle_s=0.1)
+    joint = morphology.arms[0].joints[3]
+    index, column = plant.model.actuator(joint).id, morphology.arm_names.index(joint)
+    arms = loop.action.arms.copy()
+    arms[column] += 0.08
+    sent = []
+    step = plant._step_once
+    plant._step_once = lambda: (sent.append(plant.data.ctrl[index]), step())
+    begin = plant.data.ctrl[index]
+    executed = loop.execute(RobotAction(loop.action.command, Mode.STATIONARY, arms), 0.04)
+    assert executed.arms[column] == pytest.approx(arms[column], abs=1e-6)
+    moved = np.array(sent) - begin
+    if ramps:
+        np.testing.assert_allclose(moved, 0.01 * np.arange(1, 9), atol=1e-6)
+    else:
+        assert len(set(moved[:4])) == 1

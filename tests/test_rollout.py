@@ -48,7 +48,10 @@ class Parts:
     def predict(self, state: RobotState, commands: np.ndarray, mode: Mode, threads: int = 1):
         rollout = PolicyRollout(self.model, self.policy, threads)
         try:
-            return rollout.predict(state.qpos, state.qvel, state.memory, commands, state.arms, mode)
+            executed = (state.command, state.arms, state.mode) if self.morphology.ramps else None
+            return rollout.predict(
+                state.qpos, state.qvel, state.memory, commands, state.arms, mode, executed
+            )
         finally:
             rollout.close()
 
@@ -66,14 +69,21 @@ def predict_slowly(p: Parts, state: RobotState, commands: np.ndarray, mode: Mode
     qvel = np.empty((num, horizon + 1, model.nv))
     qpos[:, 0], qvel[:, 0] = state.qpos, state.qvel
     memory, arms = np.tile(state.memory, (num, 1)), np.tile(state.arms, (num, 1))
+    command = np.tile(state.command, (num, 1))
+    executed, _ = p.policy.act(qpos[:, 0], qvel[:, 0], command, arms, memory, state.mode)
+    substeps = round(POLICY_DT / model.opt.timestep)
     for k in range(horizon):
         targets, memory = p.policy.act(qpos[:, k], qvel[:, k], commands[:, k], arms, memory, mode)
         for i in range(num):
             mujoco.mj_resetData(model, data)
-            data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i, k], qvel[i, k], targets[i]
-            for _ in range(round(POLICY_DT / model.opt.timestep)):
+            data.qpos[:], data.qvel[:] = qpos[i, k], qvel[i, k]
+            begin = executed[i] if p.morphology.ramps else targets[i]
+            for step in range(substeps):
+                share = (step + 1) / substeps
+                data.ctrl[:] = begin + share * (targets[i] - begin)
                 mujoco.mj_step(model, data)
             qpos[i, k + 1], qvel[i, k + 1] = data.qpos, data.qvel
+        executed = targets
     return Prediction(qpos, qvel, commands, np.zeros(0), memory, 0.0, 0.0)
 
 

@@ -90,6 +90,8 @@ class Morphology(ABC):
     wheeled: bool
     """Whether it stands on wheels (contact points roll, the base stays level)."""
 
+    ramps: bool = False
+    """Whether its controller goes from each set of targets to the next in a straight line."""
     variants: Mapping[str, Variant] = {"v1": Variant()}
     """Bindings of targets to the body by name; the first is the default."""
     effects: tuple[Effect, ...]

@@ -50,6 +50,13 @@ class Plant(ABC):
     def apply(self, targets: np.ndarray) -> None:
         """Set the target of every actuator, in the model's order. Shape (nu,)."""
 
+    def ramp(self, targets: np.ndarray) -> None:
+        """Go to the targets of all actuators in a straight line, within the next `step`.
+
+        Like `apply` for a body that cannot, or whose own controller does it.
+        """
+        self.apply(targets)
+
     @abstractmethod
     def step(self, dt: float) -> None:
         """Let `dt` [s] pass: simulate it, or wait for it on hardware."""

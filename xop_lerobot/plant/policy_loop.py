@@ -34,6 +34,7 @@ class PolicyLoop:
         self.morphology, self.plant, self.policy = morphology, plant, policy
         self._memory = policy.initial_memory(1)
         self.action = _round_action(morphology.rest_action())
+        self._previous: RobotAction | None = None  # executed before, while one is executed
         self._measurement: Measurement | None = None
         self._collision = self._was_read = False
 
@@ -87,8 +88,12 @@ class PolicyLoop:
         Raises:
             BadValue: If `dt` is not a whole multiple of the policy's period.
         """
+        self._previous = self.action
         self.action = limit_action(self.morphology, action, self.action, dt)
-        self.advance(dt)
+        try:
+            self.advance(dt)
+        finally:
+            self._previous = None
         return self.action
 
     def advance(self, dt: float) -> None:
@@ -104,21 +109,35 @@ class PolicyLoop:
             )
         if self._was_read:  # else nobody has seen yet what was touched before
             self._collision = self._was_read = False
-        for _ in range(steps):
-            self._run_policy()
+        for i in range(steps):
+            self._run_policy(self._find_action((i + 1) / steps))
 
-    def _run_policy(self) -> None:
+    def _find_action(self, share: float) -> RobotAction:
+        """What is executed in a period that ends after `share` of an action's time."""
+        action, previous = self.action, self._previous
+        if not self.morphology.ramps or previous is None or previous.mode is not action.mode:
+            return action
+        return RobotAction(
+            previous.command + share * (action.command - previous.command),
+            action.mode,
+            previous.arms + share * (action.arms - previous.arms),
+        )
+
+    def _run_policy(self, action: RobotAction) -> None:
         """One period of the policy: measure, act, let 20 ms pass."""
         measured = self._measurement or self.plant.measure()
         targets, self._memory = self.policy.act(
             measured.qpos[None],
             measured.qvel[None],
-            self.action.command[None],
-            self.action.arms[None],
+            action.command[None],
+            action.arms[None],
             self._memory,
-            self.action.mode,
+            action.mode,
         )
-        self.plant.apply(targets[0])
+        if self.morphology.ramps:
+            self.plant.ramp(targets[0])
+        else:
+            self.plant.apply(targets[0])
         self.plant.step(POLICY_DT)
         self._measurement = self.plant.measure()
         self._collision |= self._measurement.collision

@@ -118,6 +118,7 @@ class Simulation(Plant):
             mujoco.mj_resetData(self.model, self.data)
             self.data.qpos[: self.nq] = self._standing
             self.data.ctrl[:] = self._compute_holding_targets()
+            self._ramp_to: np.ndarray | None = None
             mujoco.mj_forward(self.model, self.data)
             self._num_steps = 0
             self._has_fallen = self._diverged = False
@@ -152,6 +153,18 @@ class Simulation(Plant):
         targets = check_vector("targets", targets, self.model.nu)
         with self._lock:
             self.data.ctrl[:] = targets
+            self._ramp_to = None
+
+    def ramp(self, targets: np.ndarray) -> None:
+        """Go to the targets in a straight line over the physics steps of the next `step`.
+
+        Raises:
+            BadShape: If there are not `nu` targets.
+            BadValue: If one is not finite.
+        """
+        targets = check_vector("targets", targets, self.model.nu)
+        with self._lock:
+            self._ramp_to = targets
 
     def step(self, dt: float) -> None:
         """Simulate `dt` [s].
@@ -163,8 +176,13 @@ class Simulation(Plant):
         with self._lock:
             if num_steps:
                 self._collisions = set()
-            for _ in range(num_steps):
+            begin, end = self.data.ctrl.copy(), self._ramp_to
+            for i in range(num_steps):
+                if end is not None:
+                    self.data.ctrl[:] = begin + (i + 1) / num_steps * (end - begin)
                 self._step_once()
+            if num_steps:
+                self._ramp_to = None
             self._touches |= self._collisions
             if num_steps:
                 self._update_positions()

@@ -87,8 +87,9 @@ class StatePredictor:
                 overlay_arms(arms[0, step], names, plan.get_arms(time))
             command = space.limit(wanted, command, POLICY_DT, mode)
             commands[0, step] = command
+        executed = (state.command, state.arms, state.mode) if self.morphology.ramps else None
         prediction = self.rollout.predict(
-            state.qpos, state.qvel, state.memory, commands, arms, mode
+            state.qpos, state.qvel, state.memory, commands, arms, mode, executed
         )
         qpos, qvel = prediction.qpos[0, -1], prediction.qvel[0, -1]
         if not (np.isfinite(qpos).all() and np.isfinite(qvel).all()):

@@ -306,8 +306,9 @@ class MpcRetargeter(Retargeter):
     def _predict(self, state: RobotState, decisions: np.ndarray, mode: Mode) -> Prediction:
         """Roll decisions out. Shape (K, H, n)."""
         commands, arms = self.decision.split(decisions, state.arms, self.command_model.body)
+        executed = (state.command, state.arms, state.mode) if self.morphology.ramps else None
         prediction = self.rollout.predict(
-            state.qpos, state.qvel, state.memory, commands, arms, mode
+            state.qpos, state.qvel, state.memory, commands, arms, mode, executed
         )
         return prediction._replace(commands=decisions)
 

@@ -82,6 +82,7 @@ class PolicyRollout:
         commands: np.ndarray,
         arms: np.ndarray,
         mode: Mode,
+        executed: tuple[np.ndarray, np.ndarray, Mode] | None = None,
     ) -> Prediction:
         """Roll `commands` out from one start state and one policy memory (Eqs. 1e, 1f).
 
@@ -93,6 +94,8 @@ class PolicyRollout:
             arms: Arm and gripper targets: held, or a sequence for each sample. Shape (m,) or
                 (K, H, m).
             mode: Mode of the low-level policy.
+            executed: Command, arms and mode executed last, from whose targets a robot that ramps
+                (`Morphology.ramps`) goes to the next in a straight line; None for steps.
 
         Returns:
             The predicted states; NaN throughout for a sample that diverged.
@@ -111,6 +114,8 @@ class PolicyRollout:
         memory = np.broadcast_to(memory, (num_rollouts, len(memory)))
         models = [self.model] * num_rollouts
         policy_s = physics_s = 0.0
+        last = None if executed is None else self._find_targets(qpos, qvel, memory, executed)
+        shares = np.arange(1, self.substeps + 1)[:, None] / self.substeps
         for step in range(horizon):
             start = perf_counter()
             targets, memory = self.policy.act(
@@ -124,7 +129,11 @@ class PolicyRollout:
             between = perf_counter()
             if targets.shape != (num_rollouts, self.model.nu):
                 raise BadShape("targets", (num_rollouts, self.model.nu), targets.shape)
-            controls[:] = targets[:, None]
+            if last is None:
+                controls[:] = targets[:, None]
+            else:
+                controls[:] = last[:, None] + shares * (targets - last)[:, None]
+                last = targets
             # All shapes are as they should be; to check and to tile them takes 0.15 ms a call.
             self._pool.rollout(
                 models,
@@ -153,6 +162,20 @@ class PolicyRollout:
             policy_s,
             physics_s,
         )
+
+    def _find_targets(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        memory: np.ndarray,
+        executed: tuple[np.ndarray, np.ndarray, Mode],
+    ) -> np.ndarray:
+        """Targets of what is executed now. Shape (1, nu)."""
+        command, arms, mode = executed
+        targets, _ = self.policy.act(
+            qpos[None], qvel[None], command[None], arms[None], memory[:1], mode
+        )
+        return targets
 
     def _sense(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         """Sensors at the start. Shape (nsensordata,)."""

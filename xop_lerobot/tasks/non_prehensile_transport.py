@@ -32,8 +32,8 @@ TOY = (0.016, 0.012, 0.012)
 """Half the edges of the toy [m]: 3.2 cm long."""
 TOY_MASS = 0.05
 """[kg]"""
-TOY_FRICTION = (0.8, 0.003, 0.0001)
-"""Soft rubber: sliding, torsion [m], rolling [m]. It slips on a palm tilted by 39°."""
+TOY_FRICTION = (0.5, 0.003, 0.0001)
+"""Hard rubber: sliding, torsion [m], rolling [m]. It slips on a palm tilted by 27°."""
 
 OPENING = (0.05, 0.025)
 """Half the edges of the container's opening [m]: 10 by 5 cm."""

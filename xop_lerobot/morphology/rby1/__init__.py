@@ -122,6 +122,8 @@ class RBY1(Morphology):
     fall_height = -0.2
     fall_tilt = 0.35
     wheeled = True
+    # Its servos follow within 10 ms: targets in steps would shake the hands.
+    ramps = True
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
         """Build RB-Y1 alone."""
