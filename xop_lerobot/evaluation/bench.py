@@ -122,7 +122,12 @@ class BareRollout:
         Raises:
             BadValue: If the planner did not ask its policy once for each control step.
         """
-        shapes = [targets.shape for targets in self._targets]
+        asked = self._targets
+        # A robot that ramps starts from the targets of what it executes: one more, of one sample.
+        ramps = len(asked) == horizon + 1 and asked[0].shape == (1, self.model.nu)
+        begins = [np.repeat(asked[0], num_samples, axis=0), *asked[1:-1]] if ramps else asked
+        asked = asked[1:] if ramps else asked
+        shapes = [targets.shape for targets in asked]
         if shapes != [(num_samples, self.model.nu)] * horizon:
             raise BadValue(
                 f"a solve of {num_samples} samples and {horizon} steps must ask the policy "
@@ -133,7 +138,11 @@ class BareRollout:
         start = np.zeros((num_samples, 1 + model.nq + model.nv + model.na))
         start[:, 1 : 1 + model.nq] = state.qpos
         start[:, 1 + model.nq : 1 + model.nq + model.nv] = state.qvel
-        controls = np.repeat(np.stack(self._targets, axis=1), self.substeps, axis=1)
+        controls = np.repeat(np.stack(asked, axis=1), self.substeps, axis=1)
+        if ramps:
+            first = np.repeat(np.stack(begins, axis=1), self.substeps, axis=1)
+            shares = np.tile(np.arange(1, self.substeps + 1) / self.substeps, horizon)
+            controls = first + shares[:, None] * (controls - first)
         out = np.empty((num_samples, controls.shape[1], start.shape[1]))
         begin = perf_counter()
         self._pool.rollout(model, self._data, start, controls, state=out)
