@@ -124,17 +124,22 @@ class Body:
         """Begin to go to `end` with minimum jerk, in `duration` [s]."""
         self._begin(end, duration, 0.0)
 
-    def walk(self, end: Posture) -> None:
+    def walk(self, end: Posture, pace: float = 1.0) -> None:
         """Begin to walk straight to `end`, evenly but for the start and the stop.
 
         Headings count as they are, so a turn may be more than half a circle.
+
+        Args:
+            end: Where to.
+            pace: Factor on the speed.
         """
         way = float(np.linalg.norm(end.place[:2] - self.posture.place[:2]))
         turn = abs(float(end.place[2] - self.posture.place[2]))
         person = self._person
         # Half of the way of each ramp is lost against even speed.
         even = max(way / person.walk_speed, turn / person.turn_speed)
-        self._begin(end, even + person.walk_start, person.walk_start)
+        start = person.walk_start / pace
+        self._begin(end, even / pace + start, start)
 
     def halt(self) -> None:
         """Break a walk or turn off, and come to rest within `HALT_S`."""

@@ -48,6 +48,8 @@ ROBOT_LAG = 0.35
 """How much later than oneself a robot is known to move [s]."""
 PRESS = 0.03
 """Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
+SURE = 0.01
+"""How much more than is just enough a person presses, to be sure [m]."""
 PRESS_MORE = 0.02
 """How much more they press after a box has slipped [m]."""
 APPROACHES = 4
@@ -64,6 +66,8 @@ HOLD_S = 3.6
 """How long the lifted box is held [s]."""
 BESIDE_TOLERANCE = 0.02
 """How far beside their places the palms may be before they close [m]."""
+LOST = 0.12
+"""A box that far from the middle between the palms is not held [m]."""
 CARRY_SPEED = 0.09
 """Mean speed of hands that hold something [m/s]."""
 BACK = 0.35
@@ -76,20 +80,26 @@ class OutOfReach(Exception):
     """The hands do not come to where they should be; the person has to stand elsewhere."""
 
 
+class Slipped(Exception):
+    """The box is no longer between the hands."""
+
+
 def carry_box(mind: Mind) -> Doing:
-    """Take the box from its support to the spot on the table."""
+    """Take the box from its support to the spot on the table; who loses it takes it again."""
     yield from find(mind, "box")
-    for _ in range(APPROACHES):
-        yield from walk_to_box(mind)
+    for attempt in range(APPROACHES):
         try:
-            yield from pick_up(mind)
-            break
+            yield from walk_to_box(mind)
+            yield from pick_up(mind, attempt * PRESS_MORE)
+            yield from walk_to_table(mind)
+            yield from put_down(mind)
+            return
         except OutOfReach:
             mind.note("the hands do not get there")
-    else:
-        raise GaveUp("does not get hold of the box")
-    yield from walk_to_table(mind)
-    yield from put_down(mind)
+        except Slipped:
+            mind.note("the box slipped out")
+            yield from open_hands(mind)
+    raise GaveUp("does not get the box to the table")
 
 
 def choose_heading(mind: Mind, name: str) -> float:
@@ -159,15 +169,20 @@ def compute_flat(mind: Mind, side: str) -> np.ndarray:
     return quat_from_matrix(np.column_stack([ahead, np.cross(outwards, ahead), outwards]))
 
 
-def pick_up(mind: Mind) -> Doing:
-    """Take hold of the box and lift it; who fails presses harder."""
+def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
+    """Take hold of the box, lift it and hold it; who fails presses harder.
+
+    Args:
+        mind: Who does.
+        harder: How much more than is known to be enough the hands press [m].
+    """
     box = mind.eyes.pose("box")[:3]
     yield from take_posture(mind, plan_posture(mind, [box]))
     press = mind.eyes.recall("press", PRESS)
     for attempt in range(GRASPS):
         yield from bring_beside(mind)
         rest = float(mind.eyes.pose("box")[2])
-        yield from close(mind, press + attempt * PRESS_MORE)
+        yield from close(mind, press + SURE + harder + attempt * PRESS_MORE)
         mind.note("lift")
         yield from shift_hands(mind, np.array([0, 0, LIFT]), CARRY_SPEED)
         yield from mind.settle()
@@ -175,6 +190,7 @@ def pick_up(mind: Mind) -> Doing:
         mind.note(f"box rose {100 * rise:.0f} cm")
         if rise > LIFTED:
             yield from mind.pause(HOLD_S)
+            check_held(mind)
             return
         yield from shift_hands(mind, np.array([0, 0, -LIFT]), CARRY_SPEED)
         yield from open_hands(mind)
@@ -359,11 +375,17 @@ def compute_height_over_spot(mind: Mind) -> float:
 
 
 def check_held(mind: Mind) -> None:
-    """Stop when the box lies on the floor.
+    """Look whether the box is still between the hands, as far as it is in view.
 
     Raises:
-        GaveUp: If the box has been dropped.
+        Slipped: If it is where it can be taken anew.
+        GaveUp: If it lies on the floor.
     """
-    palms = [mind.feel(f"{side}_palm")[2] for side in SIDES]
-    if mind.eyes.sees("box") and mind.eyes.pose("box")[2] < min(palms) - 0.3:  # noqa: PLR2004
-        raise GaveUp("the box was dropped")
+    if not mind.eyes.sees("box"):
+        return
+    box = mind.eyes.pose("box")[:3]
+    palms = np.mean([mind.feel(f"{side}_palm")[:3] for side in SIDES], axis=0)
+    if np.linalg.norm(box - palms) > LOST:
+        if box[2] < palms[2] - 3 * LOST:
+            raise GaveUp("the box was dropped")
+        raise Slipped

@@ -30,17 +30,17 @@ OVER_RIM = 0.08
 """The palm tips so far over the rim [m]."""
 EDGE = 0.04
 """From the middle of a palm to its edge, for who does not know the hand [m]."""
-BEYOND_EDGE = 0.015
+BEYOND_EDGE = 0.04
 """The toy falls so far beyond the edge of the palm [m]."""
 FREE = 0.12
 """The hand starts so far to the left of the first obstacle [m]."""
 CARRY_SPEED = 0.10
 """Mean speed of a hand on which something lies loose [m/s]."""
-AIM = (0.008, 0.02)
+AIM = (0.006, 0.015)
 """How well the toy is aimed: along the hand, and across [m]."""
 TIP = 1.3
 """Roll that tips the palm [rad]."""
-TIP_S = 1.2
+TIP_S = 1.6
 """Time of the roll [s]."""
 TILTED = 0.5
 """Tilt from which the palm is seen to have tipped [rad]."""

@@ -32,6 +32,8 @@ JUMP = 0.06
 """Distance beyond which a thing has moved, and its place is seen anew [m]."""
 WIDE = 0.8
 """How far aside of the robot's head its cameras let a person look [rad]."""
+SHARED, OWN = 0.8, 0.6
+"""Parts of an error that all things have in common, and that each has for itself."""
 TURN_NOISE = 0.02
 """Error of the orientation of what is seen [rad]."""
 HANDS = ("left_wrist", "right_wrist", "left_palm", "right_palm")
@@ -219,7 +221,9 @@ class Perception:
         if not self._is_in_view(offset, float(np.max(thing.size))):
             return
         self._in_view.add(name)
-        person, error = self._person, self._get_drift(name).value
+        person = self._person
+        # What is seen at once is seen with much the same error; only some of it is a thing's own.
+        error = SHARED * self._get_drift("").value + OWN * self._get_drift(name).value
         distance = max(float(np.linalg.norm(offset)), 1e-6)
         ray = offset / distance
         along = float(error[:3] @ ray) * ray

@@ -24,6 +24,8 @@ STUCK_FROM, STUCK, MOST_STUCK = 0.25, 0.75, 3
 """A leg of that length [m], of which so much is left, was in vain; as often as a person tries."""
 STRAIN = (0.06, 0.2)
 """Difference of height [m] and of tilt [rad] to the own head from which a robot strains."""
+LADEN = 0.5
+"""Factor on the speed of who carries something."""
 TURN_FIRST = 0.35
 """Angle up to which a person sets out without turning first [rad]."""
 
@@ -97,6 +99,7 @@ def go_to(
     """
     person = mind.person
     near = person.place_tolerance if tolerance is None else tolerance
+    laden = hands is not None  # what is carried bends a robot too
     hands = relaxed_hands(person.size) if hands is None else hands
     yield from mind.settle()
     stuck = 0
@@ -109,10 +112,10 @@ def go_to(
         target = mind.belief.place_to_own(place)
         target[:2] += mind.scatter(miss, 2)
         target[2] += float(mind.scatter(abs(turn), 1)[0])
-        yield from _walk(mind, target, hands, straight=leg % 3 == 2)  # noqa: PLR2004
+        yield from _walk(mind, target, hands, leg % 3 == 2, LADEN if laden else 1.0)  # noqa: PLR2004
         yield from mind.settle(patience=2.5)
         in_vain = miss > STUCK_FROM and compute_miss(mind, place)[0] > STUCK * miss
-        if in_vain or is_strained(mind):
+        if in_vain or (is_strained(mind) and not laden):
             yield from _come_back(mind, own, seen)
             stuck += 1
             if stuck >= MOST_STUCK:
@@ -153,7 +156,7 @@ def compute_miss(mind: Mind, place: np.ndarray) -> tuple[float, float]:
     )
 
 
-def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, *, straight: bool) -> Doing:
+def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, straight: bool, pace: float) -> Doing:
     """One leg: short ways by steps to any side, long ones ahead, with turns before and after.
 
     What the steps to the side did not bring, the person then goes straight for (`straight`).
@@ -174,14 +177,14 @@ def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, *, straight: bool) 
         course = float(np.arctan2(way[1], way[0]))
         bend = abs(float(wrap_angle(course - body.posture.place[2])))
         if TURN_FIRST < bend:
-            body.walk(_at(mind, *body.posture.place[:2], course))
+            body.walk(_at(mind, *body.posture.place[:2], course), pace)
             yield from mind.settle(patience=1.5)
             # Turning on the spot has taken the head along; aim once more.
-        body.walk(_at(mind, *target[:2], course))
+        body.walk(_at(mind, *target[:2], course), pace)
         yield from mind.finish()
         if abs(float(wrap_angle(target[2] - course))) > TURN_FIRST:
             yield from mind.pause(mind.person.decision_s)
-    body.walk(_at(mind, *target))
+    body.walk(_at(mind, *target), pace)
     yield from mind.finish()
 
 
