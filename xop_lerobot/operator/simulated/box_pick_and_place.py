@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -48,7 +49,7 @@ ROBOT_LAG = 0.35
 """How much later than oneself a robot is known to move [s]."""
 PRESS = 0.03
 """Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
-SURE = 0.01
+SURE = 0.02
 """How much more than is just enough a person presses, to be sure [m]."""
 PRESS_MORE = 0.02
 """How much more they press after a box has slipped [m]."""
@@ -70,6 +71,10 @@ LOST = 0.12
 """A box that far from the middle between the palms is not held [m]."""
 CARRY_SPEED = 0.09
 """Mean speed of hands that hold something [m/s]."""
+FIRMER = 0.015
+"""How much further in hands are that hold a box while walking [m]."""
+STRAIGHTEN_S = 2.5
+"""Time to stand up straight with a box [s]."""
 BACK = 0.35
 """How far the person steps back from the support [m]."""
 PLACE_NEAR = 0.03
@@ -311,6 +316,7 @@ def open_hands(mind: Mind) -> Doing:
 
 def walk_to_table(mind: Mind) -> Doing:
     """Step back, turn to the table and walk up to it, the box before oneself."""
+    yield from straighten_up(mind)
     hands = mind.body.posture.hands
     yield from set_mode(mind, Mode.MOBILE)
     head = mind.eyes.pose("head")
@@ -327,6 +333,20 @@ def walk_to_table(mind: Mind) -> Doing:
             break
         yield from go_to(mind, place, hands=hands, tolerance=PLACE_NEAR, tries=3)
     yield from set_mode(mind, Mode.STATIONARY)
+
+
+def straighten_up(mind: Mind) -> Doing:
+    """Stand upright with the box before oneself, and hold it more firmly, before walking."""
+    body, last = mind.body, mind.body.posture
+    hands = last.hands.copy()
+    across = hands[0][:3] - hands[1][:3]
+    across /= np.linalg.norm(across)
+    for i in range(2):
+        hands[i][:3] -= (1 - 2 * i) * FIRMER / mind.belief.scale * across
+    end = replace(last, drop=0.0, lean=np.zeros(2), look=np.zeros(2), hands=hands)
+    body.move(end, STRAIGHTEN_S)
+    yield from mind.settle()
+    check_held(mind)
 
 
 def compute_carry_place(mind: Mind, heading: float) -> np.ndarray:
