@@ -69,7 +69,7 @@ BESIDE_TOLERANCE = 0.02
 """How far beside their places the palms may be before they close [m]."""
 LOST = 0.12
 """A box that far from the middle between the palms is not held [m]."""
-CARRY_SPEED = 0.09
+CARRY_SPEED = 0.06
 """Mean speed of hands that hold something [m/s]."""
 FIRMER = 0.015
 """How much further in hands are that hold a box while walking [m]."""

@@ -20,8 +20,8 @@ GLANCE = 0.9
 """Turn of the head with which a person looks to a side [rad]."""
 MODE_TRIES = 6
 """How often a person tries a double pinch before giving up."""
-STUCK_FROM, STUCK, MOST_STUCK = 0.25, 0.75, 3
-"""A leg of that length [m], of which so much is left, was in vain; as often as a person tries."""
+MOST_STUCK = 3
+"""How often a person tries to go on with a robot that strains."""
 STRAIN = (0.06, 0.2)
 """Difference of height [m] and of tilt [rad] to the own head from which a robot strains."""
 LADEN = 0.5
@@ -114,8 +114,7 @@ def go_to(
         target[2] += float(mind.scatter(abs(turn), 1)[0])
         yield from _walk(mind, target, hands, leg % 3 == 2, LADEN if laden else 1.0)  # noqa: PLR2004
         yield from mind.settle(patience=2.5)
-        in_vain = miss > STUCK_FROM and compute_miss(mind, place)[0] > STUCK * miss
-        if in_vain or (is_strained(mind) and not laden):
+        if is_strained(mind) and not laden:
             yield from _come_back(mind, own, seen)
             stuck += 1
             if stuck >= MOST_STUCK:
