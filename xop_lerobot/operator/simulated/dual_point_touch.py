@@ -36,12 +36,14 @@ def touch_two_points(mind: Mind) -> Doing:
     """Bring both palms to their points and hold them there until it counts."""
     yield from find(mind, *POINTS)
     closer = 0.0
-    for _ in range(APPROACHES):
+    for approach in range(APPROACHES):
         place = plan_place(mind, closer)
         miss, turn = compute_miss(mind, place)
-        if miss > 2 * mind.person.place_tolerance or abs(turn) > mind.person.heading_tolerance:
+        # The first time almost there is near enough; then it was not.
+        near = mind.person.place_tolerance * (2.0 if not approach else 0.5)
+        if miss > near or abs(turn) > mind.person.heading_tolerance:
             yield from set_mode(mind, Mode.MOBILE)
-            yield from go_to(mind, place)
+            yield from go_to(mind, place, tolerance=min(near, mind.person.place_tolerance))
         yield from set_mode(mind, Mode.STATIONARY)
         yield from hold_points(mind)
         if mind.eyes.success:

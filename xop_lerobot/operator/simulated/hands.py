@@ -26,7 +26,7 @@ NOD_MORE = 0.08
 """Least further nod when a hand is not in view [rad]."""
 LARGEST_NOD = 0.45
 """Largest nod [rad]."""
-KNEES = 0.3
+KNEES = 0.1
 """How much farther out hands work for each metre of squatting [m/m]."""
 STRETCHED = 0.8
 """Share of the arm's length from which it counts as stretched."""
