@@ -52,8 +52,8 @@ class CostWeights:
     stance: float = 0.01
     collision: float = 1.0
     collision_velocity: float = 1.0
-    collision_decay: float = 10.0
-    collision_velocity_decay: float = 10.0
+    collision_decay: float = 50.0
+    collision_velocity_decay: float = 25.0
     collision_range: float = 1.0
     upright: float = 1.0
     control: float = 0.002

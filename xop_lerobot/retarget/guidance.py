@@ -100,6 +100,7 @@ class Guidance:
             poses[name],
             goal.poses[name],
             duration=float(times[-2:].max()),
+            turn_rate=float(goal.velocities[name][5]) if name in goal.velocities else 0.0,
         )
         offsets = np.zeros((len(times), 7))
         offsets[:, :2] = route.offsets_at(times)

@@ -21,6 +21,12 @@ _FINE_DRIVE, _FINE_TURN = 0.05, 0.1  # within which that gain holds [m], [rad]
 _BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
 _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
 _MAX_TWIST = 1.9  # largest twist of the waist in which the robot arrives [rad]
+_TURNING = 0.3  # yaw rate from which a goal counts as turning [rad/s]
+_TURNING_TWIST = 0.6  # largest twist of the waist behind such a goal [rad]
+    0.3,
+    0.6,
+)  # behind a goal that turns at that rate [rad/s], the waist's [rad]
+_TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
 _CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
 _LINE_UP = 0.2  # distance of the place at which its heading counts like the way to it [m]
 _LEAN = 0.1  # distance that the torso bridges by itself [m]
@@ -109,6 +115,7 @@ class RoutePlanner:
         pose: np.ndarray,
         goal: np.ndarray,
         duration: float,
+        turn_rate: float = 0.0,
     ) -> Route:
         """Simulate the way.
 
@@ -119,6 +126,8 @@ class RoutePlanner:
             pose: Pose of the frame now. Shape (7,).
             goal: Its goal, which stands still. Shape (7,).
             duration: Length of the way to look at [s].
+            turn_rate: Yaw rate of the goal; behind one that turns the base does not wait until
+                the waist is at its limit [rad/s].
         """
         heading = float(quat_yaw(qpos[3:7]))
         x = float(qpos[0]) + self._pivot * math.cos(heading)
@@ -129,7 +138,8 @@ class RoutePlanner:
             aim = _Aim(gx, gy, heading, 0.0, carried)
         else:
             carried = (self._resting[name] - self._pivot, 0.0)
-            aim = _Aim(gx, gy, float(quat_yaw(goal[3:])), _MAX_TWIST, carried)
+            twist = _MAX_TWIST if abs(turn_rate) < _TURNING else _TURNING_TWIST
+            aim = _Aim(gx, gy, float(quat_yaw(goal[3:])), twist, carried)
         v, w = speeds
         count = math.ceil(duration / _DT) + 1
         offsets, headings = np.empty((count, 2)), np.empty(count)
@@ -144,7 +154,9 @@ class RoutePlanner:
             x, y, heading = x + dx, y + dy, heading + w * _DT
         far = np.hypot(offsets[:, 0], offsets[:, 1])
         offsets *= np.maximum(0.0, 1 - _LEAN / np.maximum(far, _LEAN))[:, None]
-        share = min(max(float(far[0]) / _LEAN - 1.0, 0.0), 1.0)
+        twisted = abs(_wrap(aim.look - float(headings[0]))) - (aim.twist or math.pi)
+        share = max(float(far[0]) / _LEAN - 1.0, twisted / _TWIST_RAMP)
+        share = min(max(share, 0.0), 1.0)
         return Route(np.arange(count) * _DT, offsets, headings, share)
 
 
