@@ -23,9 +23,6 @@ _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
 _MAX_TWIST = 1.9  # largest twist of the waist in which the robot arrives [rad]
 _TURNING = 0.3  # yaw rate from which a goal counts as turning [rad/s]
 _TURNING_TWIST = 0.6  # largest twist of the waist behind such a goal [rad]
-    0.3,
-    0.6,
-)  # behind a goal that turns at that rate [rad/s], the waist's [rad]
 _TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
 _CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
 _LINE_UP = 0.2  # distance of the place at which its heading counts like the way to it [m]
