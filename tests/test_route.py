@@ -9,8 +9,12 @@ import pytest
 
 from xop_lerobot.command import Mode
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.retarget.guidance import Guidance, compute_times
+from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
+from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.route import RoutePlanner
 from xop_lerobot.state import Goal
 from xop_lerobot.transforms import make_pose, pose_multiply, quat_from_yaw, quat_yaw
@@ -135,7 +139,6 @@ def test_offsets_and_facing_at_a_time(planner, rby1):
 
 def make_retargeter(bench_robot):
     from xop_lerobot.low_level.policy import make_policy
-    from xop_lerobot.morphology.scene import build_model
 
     policy = make_policy(bench_robot.policies[0], None)
     return MpcRetargeter(bench_robot, policy, build_model(bench_robot, "planning"))
@@ -187,3 +190,69 @@ def test_a_base_that_may_not_be_moved_has_no_way():
     np.testing.assert_allclose(goals["left_wrist"][:, 1], target[1])
     assert not facing.any()
     retargeter.close()
+
+
+def make_wall(x, half_thickness=0.05, name="wall"):
+    """A wall across X, endless in Y."""
+    return Obstacle(
+        name, np.array([x, 0, 1.0]), np.array([1.0, 0, 0, 0]), np.array([half_thickness, 9, 1])
+    )
+
+
+def test_the_footprint_is_that_of_the_hull(rby1):
+    """Against the robot's own sites, turned and moved by MuJoCo."""
+    model = build_model(rby1, "planning")
+    obstacles = (make_wall(1.0), make_wall(-2.0))
+    footprint = Footprint(rby1, model, obstacles)
+    hull = {name: radius for name, radius in rby1.hull_points.items() if name.startswith("hull_")}
+    kinematics = SiteKinematics(model, tuple(hull))
+    for x, y, yaw in ((0, 0, 0), (0.3, -0.5, 1.0), (-1.2, 2.0, -2.5)):
+        qpos, _ = place(rby1, x, y, yaw)
+        sites = kinematics.compute_poses(qpos)
+        expected = min(
+            float(obstacle.compute_distance(sites[name][:3])) - radius
+            for obstacle in obstacles
+            for name, radius in hull.items()
+        )
+        axle = np.array([[x + rby1.pivot * math.cos(yaw), y + rby1.pivot * math.sin(yaw)]])
+        clearance = footprint.compute_clearance(axle, np.array([yaw]))
+        assert clearance == pytest.approx(expected, abs=1e-9)
+    footprint.set_obstacles(())
+    assert np.isinf(footprint.compute_clearance(axle, np.zeros(1)))
+
+
+def test_beside_a_wall_it_drives_on_before_it_turns(rby1):
+    """Turning on the spot would drive the tail into the wall: where it stands, nothing is free."""
+    wall = make_wall(-0.40)  # parallel to a base that faces along Y, 3 cm from its side
+    footprint = Footprint(rby1, build_model(rby1, "planning"), (wall,))
+    barred = RoutePlanner(rby1, {"head": RESTING}, footprint)
+    free = RoutePlanner(rby1, {"head": RESTING})
+    start = {"x": 0.0, "y": 0.0, "yaw": math.pi / 2}
+    goal = make_goal(3, 0.3)
+    first = go(free, rby1, goal, duration=1.6, **start)
+    other = go(barred, rby1, goal, duration=1.6, **start)
+
+    def compute_clearance(route):
+        carried = np.array([RESTING - rby1.pivot, 0.0])
+        cosine, sine = np.cos(route.headings), np.sin(route.headings)
+        far = np.hypot(*route.offsets.T)[:, None]
+        head = goal[:2] + route.offsets * (1 + LEAN / far)
+        axle = head - np.stack([cosine * carried[0], sine * carried[0]], axis=-1)
+        return footprint.compute_clearance(axle, route.headings)
+
+    assert compute_clearance(first).min() < -0.02
+    assert compute_clearance(other).min() > -0.01
+    assert abs(other.headings[5] - math.pi / 2) < 0.05  # straight at first
+    np.testing.assert_allclose(
+        go(barred, rby1, make_goal(3, 0.3), x=2.0).headings,
+        go(free, rby1, make_goal(3, 0.3), x=2.0).headings,
+    )
+
+
+def test_a_wall_behind_the_goal_makes_no_detour(rby1):
+    """What bars the way ahead, with no turn to come, is left to the barrier."""
+    footprint = Footprint(rby1, build_model(rby1, "planning"), (make_wall(1.0),))
+    barred = RoutePlanner(rby1, {"head": RESTING}, footprint)
+    route = go(barred, rby1, make_goal(1.5, 0), duration=3.0)
+    free = go(RoutePlanner(rby1, {"head": RESTING}), rby1, make_goal(1.5, 0), duration=3.0)
+    np.testing.assert_allclose(route.offsets, free.offsets)

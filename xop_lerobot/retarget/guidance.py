@@ -13,10 +13,12 @@ from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.config import MpcConfig
 from xop_lerobot.retarget.facing import FacingRule
+from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.retarget.horizon_goals import hold_near, preview
 from xop_lerobot.retarget.route import RoutePlanner
 from xop_lerobot.state import Goal
 
+_LOOK_AHEAD = 1.6  # length of a way that is looked at: about a quarter turn [s]
 _STILL = 0.2  # speed of a goal under which it counts as standing still [m/s]
 
 
@@ -32,14 +34,19 @@ class Guidance:
         morphology: The robot.
         command_model: What is decided; says whether the base drives but cannot go sideways.
         resting: How far ahead of the base each tracked frame is at rest [m].
+        footprint: Tells how near the base comes to obstacles.
     """
 
     def __init__(
-        self, morphology: Morphology, command_model: CommandModel, resting: Mapping[str, float]
+        self,
+        morphology: Morphology,
+        command_model: CommandModel,
+        resting: Mapping[str, float],
+        footprint: Footprint | None = None,
     ) -> None:
         self._command_model = command_model
         self._facing = FacingRule(morphology, resting)
-        self._routes = RoutePlanner(morphology, resting)
+        self._routes = RoutePlanner(morphology, resting, footprint)
 
     def lead(
         self,
@@ -99,7 +106,7 @@ class Guidance:
             name,
             poses[name],
             goal.poses[name],
-            duration=float(times[-2:].max()),
+            duration=max(_LOOK_AHEAD, float(times[-2:].max())),
             turn_rate=float(goal.velocities[name][5]) if name in goal.velocities else 0.0,
         )
         offsets = np.zeros((len(times), 7))

@@ -22,6 +22,7 @@ from xop_lerobot.retarget.costs import CollisionCost, FallCost, SupportArea, mak
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.drift import DriftObserver
+from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.retarget.guidance import Guidance
 from xop_lerobot.retarget.horizon_goals import hold_level
 from xop_lerobot.retarget.intervention import Verdict, judge
@@ -83,7 +84,8 @@ class MpcRetargeter(Retargeter):
             self.support = SupportArea(morphology.support, tuple(resting[:2]))
         standing = self.readings.compute_poses(morphology.standing_qpos(), morphology.frames)
         resting = {name: float(pose[0]) for name, pose in standing.items()}
-        self._guidance = Guidance(morphology, self.command_model, resting)
+        self._footprint = Footprint(morphology, model, self._collision.obstacles.obstacles)
+        self._guidance = Guidance(morphology, self.command_model, resting, self._footprint)
         self.candidates = Candidates(
             morphology,
             self.rollout.model,
@@ -178,6 +180,7 @@ class MpcRetargeter(Retargeter):
         """Keep clear of these and no others from the next solve on."""
         with self._lock:
             self._collision.set_obstacles(obstacles)
+            self._footprint.set_obstacles(obstacles)
             # Without obstacles the hull is not read, which saves time.
             hull = self.morphology.hull_points if obstacles else {}
             self.readings = Readings(self.morphology, self._model, hull)

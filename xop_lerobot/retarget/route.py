@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.transforms import quat_yaw
 
 _DT = 0.04  # step of the simulated way [s]
@@ -28,6 +29,11 @@ _CLOSE = 0.12  # distance of the axle from its place at which it faces nothing a
 _LINE_UP = 0.2  # distance of the place at which its heading counts like the way to it [m]
 _LEAN = 0.1  # distance that the torso bridges by itself [m]
 _ITERATIONS = 4  # place and heading of the arrival depend on each other
+_DETOURS = (0.4, -0.4, 0.8, -0.8)  # drives straight on or back before a turn that is barred [m]
+_DETOUR_SPEED = 0.5  # [m/s]
+_DETOUR_FROM = 0.3  # distance from the goal under which none is made: it would dance there [m]
+_DEEPER = 0.005  # by which an obstacle must come nearer than touching to bar the way [m]
+_TURNED = 0.15  # turn that is still to come where the way is barred [rad]
 
 
 @dataclass(frozen=True)
@@ -88,19 +94,29 @@ class RoutePlanner:
     :math:`v = \cos^4 e\,\sqrt{2 b d}`. Both depend on the present state alone, so that a way
     that is computed anew goes on as before.
 
+    Beside a wall a turn may be barred. The base then drives straight on or back first, the
+    shortest drive after which it can turn.
+
     Far from its goal a robot on wheels does better to turn away from it first. No horizon of a
     third of a second shows that: the way is what its goals are led along.
 
     Args:
         morphology: The robot.
         resting: How far ahead of the base each tracked frame is at rest [m].
+        footprint: Tells how near the base comes to obstacles; None: there are none.
 
     References:
         Siciliano et al., Robotics, 2009, section 11.5 (limits of feedback to a point for a
         unicycle) and 11.6 (regulation of the posture by turning and driving).
     """
 
-    def __init__(self, morphology: Morphology, resting: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        morphology: Morphology,
+        resting: Mapping[str, float],
+        footprint: Footprint | None = None,
+    ) -> None:
+        self._footprint = footprint
         self._pivot, self._resting = morphology.pivot, dict(resting)
         self._hands = {arm.frame for arm in morphology.arms}
 
@@ -137,24 +153,64 @@ class RoutePlanner:
             carried = (self._resting[name] - self._pivot, 0.0)
             twist = _MAX_TWIST if abs(turn_rate) < _TURNING else _TURNING_TWIST
             aim = _Aim(gx, gy, float(quat_yaw(goal[3:])), twist, carried)
-        v, w = speeds
         count = math.ceil(duration / _DT) + 1
-        offsets, headings = np.empty((count, 2)), np.empty(count)
-        for i in range(count):
-            ahead, aside = _rotate(*carried, heading)
-            offsets[i] = x + ahead - gx, y + aside - gy
-            headings[i] = heading
-            wanted_v, wanted_w = _steer(aim, x, y, heading)
-            v += _clamp(wanted_v - v, _ACCELERATION * _DT)
-            w += _clamp(wanted_w - w, _TURN_ACCELERATION * _DT)
-            dx, dy = _rotate(v * _DT, 0.0, heading + w * _DT / 2)
-            x, y, heading = x + dx, y + dy, heading + w * _DT
+        way = _simulate(aim, x, y, heading, speeds, count)
+        if self._footprint is not None and math.dist(way[0, :2], (gx, gy)) > _DETOUR_FROM:
+            way = self._find_free(way, aim, speeds)
+        cosine, sine = np.cos(way[:, 2]), np.sin(way[:, 2])
+        offsets = way[:, :2] - (gx, gy)
+        offsets[:, 0] += cosine * carried[0] - sine * carried[1]
+        offsets[:, 1] += sine * carried[0] + cosine * carried[1]
         far = np.hypot(offsets[:, 0], offsets[:, 1])
         offsets *= np.maximum(0.0, 1 - _LEAN / np.maximum(far, _LEAN))[:, None]
-        twisted = abs(_wrap(aim.look - float(headings[0]))) - (aim.twist or math.pi)
+        twisted = abs(_wrap(aim.look - heading)) - (aim.twist or math.pi)
         share = max(float(far[0]) / _LEAN - 1.0, twisted / _TWIST_RAMP)
         share = min(max(share, 0.0), 1.0)
-        return Route(np.arange(count) * _DT, offsets, headings, share)
+        return Route(np.arange(count) * _DT, offsets, way[:, 2], share)
+
+    def _find_free(self, way: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:
+        """The way itself, or one with a detour where its turn is barred. Shape (n, 3)."""
+        assert self._footprint is not None
+
+        def find_bar(candidate: np.ndarray) -> int | None:
+            clearance = self._footprint.compute_clearance(candidate[:, :2], candidate[:, 2])
+            bars = np.flatnonzero(clearance < min(clearance[0], 0.0) - _DEEPER)
+            return int(bars[0]) if len(bars) else None
+
+        bar = find_bar(way)
+        if bar is None or abs(way[-1, 2] - way[bar, 2]) < _TURNED:
+            return way
+        x, y, heading = (float(each) for each in way[0])
+        for detour in _DETOURS:
+            other = _simulate(aim, x, y, heading, speeds, len(way), detour)
+            if find_bar(other) is None:
+                return other
+        return way
+
+
+def _simulate(
+    aim: _Aim,
+    x: float,
+    y: float,
+    heading: float,
+    speeds: tuple[float, float],
+    count: int,
+    detour: float = 0.0,
+) -> np.ndarray:
+    """The axle's places and headings, `detour` [m] straight first. Shape (count, 3)."""
+    (v, w), way, left = speeds, np.empty((count, 3)), abs(detour)
+    for i in range(count):
+        way[i] = x, y, heading
+        if left > 0:
+            wanted_v, wanted_w = math.copysign(_DETOUR_SPEED, detour), 0.0
+            left -= abs(v) * _DT
+        else:
+            wanted_v, wanted_w = _steer(aim, x, y, heading)
+        v += _clamp(wanted_v - v, _ACCELERATION * _DT)
+        w += _clamp(wanted_w - w, _TURN_ACCELERATION * _DT)
+        dx, dy = _rotate(v * _DT, 0.0, heading + w * _DT / 2)
+        x, y, heading = x + dx, y + dy, heading + w * _DT
+    return way
 
 
 def _steer(aim: _Aim, x: float, y: float, heading: float) -> tuple[float, float]:
