@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -139,3 +140,19 @@ def test_clearance_is_the_least_distance_on_the_way():
     np.testing.assert_allclose(cost.compute_clearance(e.points), expected)
     np.testing.assert_array_equal(CollisionCost((), RADII).compute_clearance(e.points), np.inf)
     np.testing.assert_array_equal(CollisionCost((BOX,), {}).compute_clearance(e.points), np.inf)
+
+
+def test_hands_come_near_to_what_they_work_at():
+    e = make_evaluation(weights=CostWeights())
+    table = replace(BOX, handled=True)
+
+    def compute(obstacle: Obstacle, *hands: str) -> np.ndarray:
+        return CollisionCost((obstacle, WALL), RADII, hands).compute(e)
+
+    expected = CollisionCost((table,), {"b": RADII["b"]}).compute(e)
+    expected = expected + CollisionCost((WALL,), RADII).compute(e)
+    np.testing.assert_allclose(compute(table, "a"), expected)
+    assert (compute(table, "a") < compute(table)).any()
+    # What hands do not work at they keep clear of, and so does all else of what is handled.
+    np.testing.assert_array_equal(compute(BOX, "a"), compute(BOX))
+    np.testing.assert_array_equal(compute(table), compute(BOX))

@@ -78,6 +78,13 @@ def test_turns_round_for_what_is_behind() -> None:
     assert any("turn round" in text for _, text in device.mind.diary)
 
 
+def test_looks_to_both_sides_before_it_turns_round() -> None:
+    world, device = ToyWorld(make_points(bearing=1.4)), make_person(1)
+    run_touch(world, device)
+    assert world.success
+    assert not any("turn round" in text for _, text in device.mind.diary)
+
+
 def test_same_seed_same_person_and_another_is_another() -> None:
     def record(seed: int) -> np.ndarray:
         world, device = ToyWorld(make_points()), make_person(seed)

@@ -173,6 +173,14 @@ def test_obstacles_are_the_walls(rby1):
     assert names == {"wall_front", "wall_back", "wall_left", "wall_right"}
 
 
+def test_hands_work_at_the_furniture_of_their_task_alone():
+    morphology = make_morphology("rby1")
+    stage = Stage(morphology, "box_pick_and_place")
+    handled = {obstacle.name for obstacle in stage.obstacles if obstacle.handled}
+    stage.close()
+    assert handled == {"support_column", "table_column"}
+
+
 def test_task_camera_shows_something(rby1):
     picture = rby1.plant.render("task")
     assert picture.std() > 5

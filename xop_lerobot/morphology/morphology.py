@@ -108,6 +108,9 @@ class Morphology(ABC):
     hull_points: dict[str, float] = {}
     """Sites on the hull of the robot and the radius around each [m], for obstacles."""
 
+    hull_hands: tuple[str, ...] = ()
+    """Those of `hull_points` that are about hands, which may come near to what they work at."""
+
     @abstractmethod
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
         """Build the robot alone, at its rest posture, as an editable model."""

@@ -74,7 +74,7 @@ class MpcRetargeter(Retargeter):
         self.offset = OffsetObserver(self.command_model)
         hull = morphology.hull_points
         self._collision = CollisionCost(
-            make_obstacles(model) if obstacles is None else obstacles, hull
+            make_obstacles(model) if obstacles is None else obstacles, hull, morphology.hull_hands
         )
         self._model = model
         self.readings = Readings(morphology, model, hull if self._collision.obstacles else {})

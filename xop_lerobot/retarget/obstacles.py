@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -32,6 +32,7 @@ class Obstacle:
         half_size: Half the edges of the box around it, along its own axes [m]: of a cylinder
             r, r, l/2, and the caps of a capsule belong to its length. Shape (3,).
         shape: One of `SHAPES`.
+        handled: Whether hands work at it, so that they need not keep clear of it.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Obstacle:
     quat: np.ndarray
     half_size: np.ndarray
     shape: str = "box"
+    handled: bool = False
 
     def __post_init__(self) -> None:
         if self.shape not in SHAPES:
@@ -89,6 +91,8 @@ class ObstacleSet:
         self._cores = np.array([row[2] for row in rows]).reshape(-1, 3)
         self._radii = np.array([row[3] for row in rows])
         self._round = np.array([each.shape == "cylinder" for each in self.obstacles], dtype=bool)
+        self.handled = np.array([each.handled for each in self.obstacles], dtype=bool)
+        """Which of them hands work at. Shape (J,)."""
 
     def __len__(self) -> int:
         return len(self.obstacles)
@@ -156,7 +160,10 @@ def _make_row(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray, np.ndarray, f
 
 
 def make_obstacles(
-    model: mujoco.MjModel, movable: Iterable[str] = (), data: mujoco.MjData | None = None
+    model: mujoco.MjModel,
+    movable: Iterable[str] = (),
+    data: mujoco.MjData | None = None,
+    handled: Iterable[str] = (),
 ) -> tuple[Obstacle, ...]:
     """Solid geoms that are fixed to the world, the ground (planes, height fields) apart.
 
@@ -167,6 +174,7 @@ def make_obstacles(
         model: Model of the scene; the robot in it moves, so it is none.
         movable: Bodies that count too, where they are.
         data: Where they are; by default where the model starts.
+        handled: Those of `movable` that hands work at.
 
     Raises:
         UnknownName: If there is no such body; carries those that move.
@@ -175,7 +183,7 @@ def make_obstacles(
         data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     bodies = {model.body(i).name: i for i in range(model.nbody) if model.body_weldid[i]}
-    wanted = set()
+    wanted, worked_at = set(), {bodies[name] for name in handled if name in bodies}
     for name in movable:
         if name not in bodies:
             raise UnknownName("movable body", name, bodies)
@@ -186,7 +194,9 @@ def make_obstacles(
         solid = model.geom_contype[i] or model.geom_conaffinity[i]
         if (weld and weld not in wanted) or not solid or model.geom_type[i] in _GROUND:
             continue
-        obstacles.append(_make_obstacle(model, data, i))
+        obstacle = _make_obstacle(model, data, i)
+        at_work = int(model.geom_bodyid[i]) in worked_at
+        obstacles.append(replace(obstacle, handled=True) if at_work else obstacle)
     return tuple(obstacles)
 
 

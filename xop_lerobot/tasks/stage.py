@@ -102,9 +102,14 @@ class Stage:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Walls and furniture, where they stand now, without what hands work over."""
+        """Walls and furniture, where they stand now, without what hands work over.
+
+        What hands work at is `handled`.
+        """
         with self.plant.lock:
-            known = make_obstacles(self.plant.model, self.task.furniture, self.plant.data)
+            known = make_obstacles(
+                self.plant.model, self.task.furniture, self.plant.data, self.task.handled
+            )
         return tuple(each for each in known if each.name not in self.task.passable)
 
     def view(self, state: RobotState) -> View:

@@ -119,6 +119,7 @@ class RBY1(Morphology):
     pivot = PIVOT
     support = SUPPORT
     hull_points = HULL
+    hull_hands = ("left_palm", "right_palm")
     fall_height = -0.2
     fall_tilt = 0.35
     wheeled = True

@@ -10,7 +10,7 @@ from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.body import Posture, relaxed_hands
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.transforms import quat_to_rpy, wrap_angle
+from xop_lerobot.transforms import quat_from_yaw, quat_rotate, quat_to_rpy, wrap_angle
 
 LAG = 0.4
 """How long a person still looks when the own turn is over: the robot may be behind [s]."""
@@ -31,10 +31,13 @@ TURN_FIRST = 0.35
 
 
 def find(mind: Mind, *names: str) -> Doing:
-    """Look; what is not in view is behind, so turn round on the spot until it is."""
+    """Look ahead, then to both sides; what is not there is behind: turn round until it is seen."""
     while mind.eyes.is_blind:
         yield
     yield from mind.pause(mind.person.decision_s)
+    if not _knows(mind, names):
+        mind.note("look to both sides")
+        yield from glance(mind, *names)
     if _knows(mind, names):
         return
     mind.note("turn round to look")
@@ -107,7 +110,7 @@ def go_to(
         miss, turn = compute_miss(mind, place)
         if miss <= near and abs(turn) <= person.heading_tolerance:
             return
-        own, seen = mind.body.posture.place, mind.eyes.pose("head")
+        own, seen, turn_then = mind.body.posture.place, mind.eyes.pose("head"), mind.belief.turn
         mind.note(f"leg {leg}: {100 * miss:.0f} cm, {np.degrees(turn):.0f}° to go")
         target = mind.belief.place_to_own(place)
         target[:2] += mind.scatter(miss, 2)
@@ -115,7 +118,7 @@ def go_to(
         yield from _walk(mind, target, hands, leg % 3 == 2, LADEN if laden else 1.0)  # noqa: PLR2004
         yield from mind.settle(patience=2.5)
         if is_strained(mind) and not laden:
-            yield from _come_back(mind, own, seen)
+            yield from _come_back(mind, own, seen, turn_then)
             stuck += 1
             if stuck >= MOST_STUCK:
                 return
@@ -129,17 +132,19 @@ def is_strained(mind: Mind) -> bool:
     return bool(lift > STRAIN[0] or tilt.max() > STRAIN[1])
 
 
-def _come_back(mind: Mind, own: np.ndarray, seen: np.ndarray) -> Doing:
+def _come_back(mind: Mind, own: np.ndarray, seen: np.ndarray, turn: float) -> Doing:
     """Go back to as far as the robot has come along; pushing on would not help it.
 
     Args:
         mind: Who walked.
         own: Where the person stood before. Shape (3,).
         seen: Where the robot's head was then. Shape (7,).
+        turn: How the robot's world was believed to be turned then: a robot that bends now tells
+            nothing of it [rad].
     """
     mind.note("the robot does not come along")
     head = mind.eyes.pose("head")
-    came = mind.belief.vector_to_own(head[:3] - seen[:3]) * mind.belief.scale
+    came = quat_rotate(quat_from_yaw(-turn), head[:3] - seen[:3])
     turned = wrap_angle(compute_heading(head[3:]) - compute_heading(seen[3:]))
     target = own + np.array([came[0], came[1], float(turned)])
     mind.body.walk(_at(mind, *target))

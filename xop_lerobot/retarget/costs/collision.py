@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
@@ -28,12 +28,20 @@ class CollisionCost(Cost):
     Args:
         obstacles: What to keep clear of.
         points: Sites on the hull of the robot and the radius around each [m].
+        hands: Those of `points` that are about hands: what is `handled` is none of their
+            obstacles.
     """
 
     name = "collision"
 
-    def __init__(self, obstacles: Iterable[Obstacle], points: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        obstacles: Iterable[Obstacle],
+        points: Mapping[str, float],
+        hands: Collection[str] = (),
+    ) -> None:
         self.points = dict(points)
+        self._hands = np.array([point in hands for point in self.points], dtype=bool)
         self._radii = np.array(list(self.points.values()))
         self.set_obstacles(obstacles)
 
@@ -105,7 +113,11 @@ class CollisionCost(Cost):
     def _compute_distances(self, hull: np.ndarray, which: np.ndarray | None) -> np.ndarray:
         """Distance of the whole hull to each obstacle [m]. (..., P, 3) -> (..., n)."""
         distances = self.obstacles.compute_distances(hull, which)  # (..., P, n)
-        return (distances - self._radii[:, None]).min(axis=-2)
+        distances -= self._radii[:, None]
+        handled = self.obstacles.handled if which is None else self.obstacles.handled[which]
+        if handled.any() and self._hands.any():
+            distances[..., np.outer(self._hands, handled)] = np.inf
+        return distances.min(axis=-2)
 
 
 def _compute_barrier(distances: np.ndarray, decay: float, cut_off: float) -> np.ndarray:
