@@ -156,3 +156,12 @@ def test_hands_come_near_to_what_they_work_at():
     # What hands do not work at they keep clear of, and so does all else of what is handled.
     np.testing.assert_array_equal(compute(BOX, "a"), compute(BOX))
     np.testing.assert_array_equal(compute(table), compute(BOX))
+
+
+def test_base_that_stands_keeps_clear_of_nothing():
+    e = make_evaluation(weights=CostWeights(), drives=False)
+    expected = CollisionCost((BOX, WALL), {"a": RADII["a"]}).compute(e)
+    cost = CollisionCost((BOX, WALL), RADII, base=("b",))
+    np.testing.assert_array_equal(cost.compute(e), expected)
+    whole = CollisionCost((BOX, WALL), RADII)
+    np.testing.assert_array_equal(cost.compute(replace(e, drives=True)), whole.compute(e))

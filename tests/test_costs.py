@@ -75,6 +75,7 @@ def make_evaluation(seed: int = 0, **fields) -> Evaluation:
         "dt": DT,
         "weights": WEIGHTS,
         "upright": ("left_wrist",),
+        "drives": True,
     }
     names = {field.name for field in dataclasses.fields(Evaluation)}
     return Evaluation(**{name: (values | fields)[name] for name in names})

@@ -179,6 +179,10 @@ def test_hands_work_at_the_furniture_of_their_task_alone():
     handled = {obstacle.name for obstacle in stage.obstacles if obstacle.handled}
     stage.close()
     assert handled == {"support_column", "table_column"}
+    stage = Stage(morphology, "non_prehensile_transport")
+    free = {obstacle.name for obstacle in stage.obstacles if not obstacle.handled}
+    stage.close()
+    assert free == {f"wall_{side}" for side in ("front", "back", "left", "right")}
 
 
 def test_task_camera_shows_something(rby1):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 
@@ -18,6 +20,12 @@ def find_site(model: mujoco.MjModel, name: str) -> int:
     if index < 0:
         raise UnknownName("site", name, [model.site(i).name for i in range(model.nsite)])
     return index
+
+
+def find_sites_on(model: mujoco.MjModel, body: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Those of the sites `names` that are on a body."""
+    wanted = model.body(body).id
+    return tuple(n for n in names if model.site_bodyid[find_site(model, n)] == wanted)
 
 
 class Linearisation:

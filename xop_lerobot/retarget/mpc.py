@@ -26,6 +26,7 @@ from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.retarget.guidance import Guidance
 from xop_lerobot.retarget.horizon_goals import hold_level
 from xop_lerobot.retarget.intervention import Verdict, judge
+from xop_lerobot.retarget.linearisation import find_sites_on
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.offset import OffsetObserver
 from xop_lerobot.retarget.optimizer import SamplingOptimizer, build_optimizer
@@ -74,7 +75,10 @@ class MpcRetargeter(Retargeter):
         self.offset = OffsetObserver(self.command_model)
         hull = morphology.hull_points
         self._collision = CollisionCost(
-            make_obstacles(model) if obstacles is None else obstacles, hull, morphology.hull_hands
+            make_obstacles(model) if obstacles is None else obstacles,
+            hull,
+            hands=morphology.hull_hands,
+            base=find_sites_on(model, morphology.base_body, hull),
         )
         self._model = model
         self.readings = Readings(morphology, model, hull if self._collision.obstacles else {})
@@ -372,6 +376,7 @@ class MpcRetargeter(Retargeter):
             dt=POLICY_DT,
             weights=config.weights,
             upright=tuple(name for name in self._find_upright() if name in sites),
+            drives=bool((decided & self.command_model.is_velocity()).any()),
         )
 
     def _apply(

@@ -32,7 +32,7 @@ class Obstacle:
         half_size: Half the edges of the box around it, along its own axes [m]: of a cylinder
             r, r, l/2, and the caps of a capsule belong to its length. Shape (3,).
         shape: One of `SHAPES`.
-        handled: Whether hands work at it, so that they need not keep clear of it.
+        handled: Whether hands work at it, or closely beside it, and need not keep clear of it.
     """
 
     name: str

@@ -83,6 +83,7 @@ class NonPrehensileTransport(Task):
     scenes: Mapping[str, str] = {"g1": "empty", "rby1": "small_room"}
     furniture = ("container", "obstacle_0", "obstacle_1")
     handled = ("container",)
+    close_by = ("obstacle_0", "obstacle_1")
     ends_on_collision = True
 
     def __init__(self, morphology: Morphology) -> None:

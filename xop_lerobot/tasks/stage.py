@@ -104,12 +104,11 @@ class Stage:
     def obstacles(self) -> tuple[Obstacle, ...]:
         """Walls and furniture, where they stand now, without what hands work over.
 
-        What hands work at is `handled`.
+        What hands work at, or have to pass closely, is `handled`.
         """
         with self.plant.lock:
-            known = make_obstacles(
-                self.plant.model, self.task.furniture, self.plant.data, self.task.handled
-            )
+            near = (*self.task.handled, *self.task.close_by)
+            known = make_obstacles(self.plant.model, self.task.furniture, self.plant.data, near)
         return tuple(each for each in known if each.name not in self.task.passable)
 
     def view(self, state: RobotState) -> View:

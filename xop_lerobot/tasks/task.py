@@ -60,6 +60,8 @@ class Task(ABC):
     """Bodies that stand still and that a robot may run into."""
     handled: tuple[str, ...] = ()
     """Those of `furniture` that the hands may touch."""
+    close_by: tuple[str, ...] = ()
+    """Those that hands may not touch, but must pass so closely that the person sees to it."""
     ends_on_collision: ClassVar[bool] = False
     """Whether running into furniture or a wall loses the episode."""
     passable: tuple[str, ...] = ()

@@ -30,6 +30,8 @@ class CollisionCost(Cost):
         points: Sites on the hull of the robot and the radius around each [m].
         hands: Those of `points` that are about hands: what is `handled` is none of their
             obstacles.
+        base: Those of `points` that are about the base: while nothing drives it they cost
+            nothing, or how it trembles beside something would count for more than any goal.
     """
 
     name = "collision"
@@ -39,9 +41,11 @@ class CollisionCost(Cost):
         obstacles: Iterable[Obstacle],
         points: Mapping[str, float],
         hands: Collection[str] = (),
+        base: Collection[str] = (),
     ) -> None:
         self.points = dict(points)
         self._hands = np.array([point in hands for point in self.points], dtype=bool)
+        self._base = np.array([point in base for point in self.points], dtype=bool)
         self._radii = np.array(list(self.points.values()))
         self.set_obstacles(obstacles)
 
@@ -66,7 +70,8 @@ class CollisionCost(Cost):
         near = self.obstacles.find_near(hull, weights.collision_range + self._radii.max())
         if not len(near):
             return np.zeros(num)
-        distances = self._compute_distances(hull, near)  # (K, H + 1, n)
+        left_out = None if evaluation.drives else self._base
+        distances = self._compute_distances(hull, near, left_out)  # (K, H + 1, n)
         speed = np.square(evaluation.qvel[:, 1:, :2]).sum(-1)
         speed = np.concatenate([speed, speed[:, -1:]], axis=1)
         barrier = weights.collision * _compute_barrier(
@@ -110,13 +115,20 @@ class CollisionCost(Cost):
         """Positions of the hull's sites. Shape (..., P, 3)."""
         return np.stack([points[site] for site in self.points], axis=-2)
 
-    def _compute_distances(self, hull: np.ndarray, which: np.ndarray | None) -> np.ndarray:
-        """Distance of the whole hull to each obstacle [m]. (..., P, 3) -> (..., n)."""
+    def _compute_distances(
+        self, hull: np.ndarray, which: np.ndarray | None, left_out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Distance of the hull, but for what is left out, to each obstacle [m].
+
+        Shapes (..., P, 3) and (P,) -> (..., n).
+        """
         distances = self.obstacles.compute_distances(hull, which)  # (..., P, n)
         distances -= self._radii[:, None]
         handled = self.obstacles.handled if which is None else self.obstacles.handled[which]
         if handled.any() and self._hands.any():
             distances[..., np.outer(self._hands, handled)] = np.inf
+        if left_out is not None:
+            distances[..., left_out, :] = np.inf
         return distances.min(axis=-2)
 
 

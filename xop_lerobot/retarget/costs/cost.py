@@ -39,6 +39,7 @@ class Evaluation:
         dt: Time between steps [s].
         weights: The weights.
         upright: Tracked frames whose hand is to stay level.
+        drives: Whether anything that is decided moves the base over the ground.
     """
 
     qpos: np.ndarray
@@ -61,6 +62,7 @@ class Evaluation:
     dt: float
     weights: CostWeights
     upright: tuple[str, ...] = ()
+    drives: bool = True
 
 
 class Cost(ABC):
