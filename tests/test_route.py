@@ -256,3 +256,33 @@ def test_a_wall_behind_the_goal_makes_no_detour(rby1):
     route = go(barred, rby1, make_goal(1.5, 0), duration=3.0)
     free = go(RoutePlanner(rby1, {"head": RESTING}), rby1, make_goal(1.5, 0), duration=3.0)
     np.testing.assert_allclose(route.offsets, free.offsets)
+
+
+def test_the_waist_goes_round_by_its_front(rby1, planner):
+    """From one limit to beyond the other the head has to turn all the way back."""
+    qpos, head = place(rby1)
+    head = pose_multiply(head, make_pose([0, 0, 0], quat_from_yaw(2.1)))
+    goal = make_pose(head[:3], quat_from_yaw(-2.0))  # 2.2 rad on in the barred direction
+    route = planner.plan(qpos, (0.0, 0.0), "head", head, goal, 4.0)
+    looks = -2.0 + route.turns
+    twists = np.unwrap(looks) - route.headings
+    twists -= math.tau * np.round(twists[0] / math.tau)
+    assert twists[0] == pytest.approx(2.1)
+    assert np.abs(twists).max() < 2.21
+    assert np.abs(np.diff(twists)).max() < 1.51 * 0.04
+    assert route.turns[-1] == pytest.approx(0, abs=1e-9)
+    # A turn that is free is not held up: at its speed it is there.
+    goal = make_pose(head[:3], quat_from_yaw(1.5))
+    route = planner.plan(qpos, (0.0, 0.0), "head", head, goal, 1.0)
+    assert not route.turns[11:].any()
+
+
+def test_a_goal_behind_the_back_is_waited_for(rby1, planner):
+    """Beyond both limits the waist stays on its side until the base has turned."""
+    qpos, head = place(rby1)
+    head = pose_multiply(head, make_pose([0, 0, 0], quat_from_yaw(2.2)))
+    goal = make_pose(head[:3], quat_from_yaw(-3.0))
+    route = planner.plan(qpos, (0.0, 0.0), "head", head, goal, 6.0)
+    assert route.share == 1
+    assert route.turns[0] == pytest.approx(2.2 - (math.tau - 3.0), abs=1e-6)
+    assert route.turns[-1] == pytest.approx(0, abs=1e-9)

@@ -17,6 +17,7 @@ from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.retarget.horizon_goals import hold_near, preview
 from xop_lerobot.retarget.route import RoutePlanner
 from xop_lerobot.state import Goal
+from xop_lerobot.transforms import quat_from_yaw, quat_multiply
 
 _LOOK_AHEAD = 1.6  # length of a way that is looked at: about a quarter turn [s]
 _STILL = 0.2  # speed of a goal under which it counts as standing still [m/s]
@@ -109,10 +110,14 @@ class Guidance:
             duration=max(_LOOK_AHEAD, float(times[-2:].max())),
             turn_rate=float(goal.velocities[name][5]) if name in goal.velocities else 0.0,
         )
-        offsets = np.zeros((len(times), 7))
-        offsets[:, :2] = route.offsets_at(times)
+        offsets, turns = route.offsets_at(times), quat_from_yaw(route.turns_at(times))
         goals = preview(goal, tuple(poses), times, config.preview_s)
-        led = {each: track + offsets for each, track in goals.items()}
+        led = {}
+        for each, track in goals.items():
+            led[each] = np.array(track)
+            led[each][:, :2] += offsets
+            if each == name:
+                led[each][:, 3:] = quat_multiply(turns, track[:, 3:])
         return led, route.facing_at(float(times[-2]))
 
 

@@ -22,10 +22,15 @@ _FINE_DRIVE, _FINE_TURN = 0.05, 0.1  # within which that gain holds [m], [rad]
 _BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
 _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
 _MAX_TWIST = 1.9  # largest twist of the waist in which the robot arrives [rad]
+_WAIST_LIMIT, _WAIST_SPEED = 2.2, 1.5  # of the waist that turns the head [rad], [rad/s]
 _TURNING = 0.3  # yaw rate from which a goal counts as turning [rad/s]
 _TURNING_TWIST = 0.6  # largest twist of the waist behind such a goal [rad]
 _TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
 _CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
+_MUST_TURN = 0.05  # turn back into what the waist allows from which on it comes first [rad]
+_CLOSE_TURNING = (
+    0.35  # that distance meanwhile: a turn carries the head off, by twice the pivot [m]
+)
 _LINE_UP = 0.2  # distance of the place at which its heading counts like the way to it [m]
 _LEAN = 0.1  # distance that the torso bridges by itself [m]
 _ITERATIONS = 4  # place and heading of the arrival depend on each other
@@ -45,13 +50,20 @@ class Route:
         offsets: Where it is carried, less the goal, by more than the torso bridges [m].
             Shape (n, 2).
         headings: Heading of the base, not wrapped [rad]. Shape (n,).
+        turns: How far the frame is to be turned from its goal about the vertical, since the waist
+            has to go round by its front; 0 once it can be at its goal [rad]. Shape (n,).
         share: How much that heading counts, from 0 at the goal to 1 away from it.
     """
 
     times: np.ndarray
     offsets: np.ndarray
     headings: np.ndarray
+    turns: np.ndarray
     share: float
+
+    def turns_at(self, ahead: np.ndarray) -> np.ndarray:
+        """Turns from the goal at times from now [s]. (n,) -> (n,)."""
+        return np.interp(ahead, self.times, self.turns)
 
     def offsets_at(self, ahead: np.ndarray) -> np.ndarray:
         """Offsets from the goal at times from now [s], the outermost beyond. (n,) -> (n, 2)."""
@@ -166,7 +178,10 @@ class RoutePlanner:
         twisted = abs(_wrap(aim.look - heading)) - (aim.twist or math.pi)
         share = max(float(far[0]) / _LEAN - 1.0, twisted / _TWIST_RAMP)
         share = min(max(share, 0.0), 1.0)
-        return Route(np.arange(count) * _DT, offsets, way[:, 2], share)
+        turns = np.zeros(count)
+        if name not in self._hands:
+            turns = _unwind(float(quat_yaw(pose[3:])) - heading, aim.look, way[:, 2])
+        return Route(np.arange(count) * _DT, offsets, way[:, 2], turns, share)
 
     def _find_free(self, way: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:
         """The way itself, or one with a detour where its turn is barred. Shape (n, 3)."""
@@ -213,12 +228,30 @@ def _simulate(
     return way
 
 
+def _unwind(twist: float, look: float, headings: np.ndarray) -> np.ndarray:
+    """Turns of the head from where its goal looks, as the waist gets there by its front [rad].
+
+    A waist at its limit on one side, whose goal is just beyond that of the other, has to go all
+    the way back; the shortest turn of the head is barred. Shape (n,).
+    """
+    twist, turns = _clamp(_wrap(twist), _WAIST_LIMIT), np.empty(len(headings))
+    for i, heading in enumerate(headings):
+        wanted = _wrap(look - heading)
+        if abs(wanted) > _WAIST_LIMIT:  # out of reach on either side: wait on this one
+            wanted = math.copysign(_WAIST_LIMIT, twist)
+        if i:
+            twist += _clamp(wanted - twist, _WAIST_SPEED * _DT)
+        turns[i] = _wrap(heading + twist - look)
+    return turns
+
+
 def _steer(aim: _Aim, x: float, y: float, heading: float) -> tuple[float, float]:
     """Speed and yaw rate that are wanted of the axle at x, y [m/s], [rad/s]."""
     end = aim.clip(heading)
     dx, dy = aim.find_way(x, y, end)
     turn = _wrap(end - heading)
-    if math.hypot(dx, dy) >= _CLOSE:
+    must_turn = aim.twist > 0 and abs(turn) > _MUST_TURN
+    if math.hypot(dx, dy) >= (_CLOSE_TURNING if must_turn else _CLOSE):
         turn, dx, dy = min(
             (_face(aim, x, y, heading, sign) for sign in (1.0, -1.0)), key=lambda way: way[0]
         )[1:]
