@@ -28,9 +28,7 @@ _TURNING_TWIST = 0.6  # largest twist of the waist behind such a goal [rad]
 _TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
 _CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
 _MUST_TURN = 0.05  # turn back into what the waist allows from which on it comes first [rad]
-_CLOSE_TURNING = (
-    0.35  # that distance meanwhile: a turn carries the head off, by twice the pivot [m]
-)
+_CLOSE_TURNING = 0.35  # that distance meanwhile: a turn carries the head off [m]
 _LINE_UP = 0.2  # distance of the place at which its heading counts like the way to it [m]
 _LEAN = 0.1  # distance that the torso bridges by itself [m]
 _ITERATIONS = 4  # place and heading of the arrival depend on each other
