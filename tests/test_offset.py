@@ -219,3 +219,22 @@ def test_with_it_a_robot_has_no_steady_offset():
     without, with_it = lean(observe=False), lean(observe=True)
     assert with_it[0] < min(0.005, 0.5 * without[0])
     assert with_it[1] < min(0.01, 0.5 * without[1])
+
+
+def test_a_servo_at_its_limit_may_be_far_from_its_command():
+    """How much is counted on is a choice: a fifth of half the range, or all that is there."""
+    rby1 = make_morphology("rby1")
+    space, planning = rby1.command_space, build_model(rby1, "planning")
+    model = CommandModel(planning, space, rby1.effects, rby1.pivot)
+    index = space.index("torso_3")
+    sagging = rby1.standing_qpos()
+    sagging[planning.joint("torso_3").qposadr[0]] = space.neutral[index] - 0.6
+    offsets = []
+    for observer in (OffsetObserver(model), OffsetObserver(model, largest=1.0)):
+        observer.reset(space.neutral)
+        for tick in range(200):
+            observer.update(DT * tick, sagging, space.neutral)
+        offsets.append(observer.offset[index])
+    half_range = (space.high - space.low)[index] / 2
+    assert offsets[0] == pytest.approx(-0.2 * half_range)
+    assert offsets[1] == pytest.approx(-0.6, abs=0.01)

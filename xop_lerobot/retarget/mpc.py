@@ -72,7 +72,10 @@ class MpcRetargeter(Retargeter):
             model, self.space, self.decision.effects, morphology.pivot
         )
         self.drift = DriftObserver(self.command_model, lag_s=morphology.velocity_lag_s)
-        self.offset = OffsetObserver(self.command_model)
+        # A servo at its limit may be far from its command, and the rest of the torso has to know;
+        # a policy that is far from it is on its way.
+        largest = 1.0 if morphology.wheeled else 0.2
+        self.offset = OffsetObserver(self.command_model, largest=largest)
         hull = morphology.hull_points
         self._collision = CollisionCost(
             make_obstacles(model) if obstacles is None else obstacles,

@@ -7,7 +7,6 @@ import numpy as np
 from xop_lerobot.retarget.command_model import CommandModel
 
 _QUIET = 0.03  # distance of the lagged command from the command at which a robot rests, of scale
-_MAX = 0.2  # largest offset, of scale
 
 
 class OffsetObserver:
@@ -24,14 +23,18 @@ class OffsetObserver:
     Args:
         command_model: What a command does, and with what lag.
         time_constant: τ [s].
+        largest: Largest offset, in shares of a command's scale.
 
     Attributes:
         settled: The lagged command. Shape (k,).
         offset: o; zero for velocities. Shape (k,).
     """
 
-    def __init__(self, command_model: CommandModel, time_constant: float = 0.6) -> None:
+    def __init__(
+        self, command_model: CommandModel, time_constant: float = 0.6, largest: float = 0.2
+    ) -> None:
         self.command_model, self.time_constant = command_model, time_constant
+        self.largest = largest
         space = command_model.space
         self._scale = (space.high - space.low) / 2
         self.reset(space.neutral)
@@ -67,4 +70,5 @@ class OffsetObserver:
         known = quiet & ~model.is_velocity() & np.isfinite(beside)
         gain = -np.expm1(-dt / self.time_constant)
         moved = self.offset + gain * np.where(known, beside, 0.0)
-        self.offset = np.clip(moved, -_MAX * self._scale, _MAX * self._scale)
+        reach = self.largest * self._scale
+        self.offset = np.clip(moved, -reach, reach)
