@@ -105,6 +105,9 @@ class Morphology(ABC):
     support: tuple[tuple[float, float], ...] = ()
     """Corners (x, y) in the base's frame, counterclockwise, of the area on which a robot that
     cannot step stands [m]; empty for one whose policy keeps the balance."""
+    has_stiff_body: bool = False
+    """Whether the joints of the command are on stiff servos that do just as they are told."""
+
     hull_points: dict[str, float] = {}
     """Sites on the hull of the robot and the radius around each [m], for obstacles."""
 

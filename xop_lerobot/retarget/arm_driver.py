@@ -9,6 +9,7 @@ import numpy as np
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arm_bias import ArmBias
 from xop_lerobot.retarget.arm_ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
+from xop_lerobot.retarget.servo_filter import SteadyBody
 from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
 from xop_lerobot.state import FRAMES, Goal, RobotState
 
@@ -32,6 +33,7 @@ class ArmDriver:
         self.morphology = morphology
         self.ik = ArmIk(morphology)
         self.bias = ArmBias(self.ik.joint_range, time_constant=BIAS_TIME)
+        self._body = SteadyBody(morphology, self.ik.model)
         self._joints = [joint for arm in morphology.arms for joint in arm.joints]
         self.forget()
 
@@ -68,9 +70,12 @@ class ArmDriver:
         if not np.array_equal(executed, self._sent) or self._decided != frozenset(decided):
             self._wanted = executed
             self.bias.reset()
+            self._body.reset()
         self._decided = frozenset(decided)
         wrists = compute_wrist_goals(self._find_ik_goals(goal), head)
-        last, wanted = self._wanted, self.ik.solve(state.qpos, self._wanted, wrists, dt)
+        # What the encoders of the body tremble by, the hands would make up for in earnest.
+        body = self._body.update(state.qpos, state.command, dt)
+        last, wanted = self._wanted, self.ik.solve(body, self._wanted, wrists, dt)
         planned = np.zeros(num_joints, dtype=bool)
         for name, angle in decided.items():
             i = self._joints.index(name)

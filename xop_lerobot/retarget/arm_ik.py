@@ -40,7 +40,7 @@ class ArmIk:
         iterations: int = 2,
     ) -> None:
         self.iterations = iterations
-        model = morphology.build_spec("full").compile()
+        self.model = model = morphology.build_spec("full").compile()
         joints = [joint for arm in morphology.arms for joint in arm.joints]
         self.num_joints = len(joints)
         self.qpos_address = np.array([int(model.joint(joint).qposadr[0]) for joint in joints])

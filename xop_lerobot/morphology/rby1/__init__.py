@@ -118,6 +118,7 @@ class RBY1(Morphology):
     velocity_lag_s = 0.0
     pivot = PIVOT
     support = SUPPORT
+    has_stiff_body = True
     hull_points = HULL
     hull_hands = ("left_palm", "right_palm")
     fall_height = -0.2
