@@ -81,6 +81,9 @@ class Morphology(ABC):
     arms: tuple[ArmChain, ...]
     arm_rest: dict[str, float]
     """Rest angle of each arm joint [rad]; joints that are not named rest at 0."""
+    arm_limits: Mapping[str, tuple[float, float]] = {}
+    """Angles that inverse kinematics keep arm joints within, where that is less than they could
+    go [rad]: what the robot's low-level policies can do with."""
     contact_points: tuple[str, ...]
     """Sites of the points on which the robot stands (four a foot; one a wheel)."""
     fall_height: float

@@ -52,13 +52,17 @@ class ArmBias:
         self._velocity = np.zeros(len(self.joint_range))
         self._slow_s = 0.0
 
-    def update(self, offset: np.ndarray, moved: np.ndarray, dt: float) -> None:
+    def update(
+        self, offset: np.ndarray, moved: np.ndarray, dt: float, free: np.ndarray | None = None
+    ) -> None:
         """Learn from one tick.
 
         Args:
             offset: Measured angles less the targets executed last, q − s [rad]. Shape (n,).
             moved: How far the wanted angles have moved since the last update [rad]. Shape (n,).
             dt: Time since then [s]; without any, nothing is learned.
+            free: Factor on the rate at which each joint learns, 1 for a free arm, 0 for one that
+                presses as hard as it may. Shape (n,).
         """
         if dt <= 0:
             return
@@ -68,7 +72,8 @@ class ArmBias:
         self._slow_s = self._slow_s + dt if is_slow else 0.0
         if self._slow_s < self.rest_s:
             return
-        bias = self.bias - np.expm1(-dt / self.time_constant) * (offset - self.bias)
+        share = -np.expm1(-dt / self.time_constant) * (1.0 if free is None else free)
+        bias = self.bias + share * (offset - self.bias)
         self.bias = np.clip(bias, -self.max_bias, self.max_bias)
 
     def compute_targets(self, wanted: np.ndarray) -> np.ndarray:

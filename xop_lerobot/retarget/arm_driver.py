@@ -8,7 +8,9 @@ import numpy as np
 
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arm_bias import ArmBias
+from xop_lerobot.retarget.arm_hold import ArmHold
 from xop_lerobot.retarget.arm_ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
+from xop_lerobot.retarget.arm_load import ArmLoad
 from xop_lerobot.retarget.servo_filter import SteadyBody
 from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
 from xop_lerobot.state import FRAMES, Goal, RobotState
@@ -16,6 +18,10 @@ from xop_lerobot.state import FRAMES, Goal, RobotState
 BIAS_TIME = 1.5
 """Time in which offsets of the arms are learned [s]. With 0.5 s the arms of G1, which are soft,
 swing a box that they hold between them."""
+PRESSING = (5.0, 15.0)
+"""Force of a hand from which its arm's offsets are learned more slowly, and no more [N]. What a
+hand presses against keeps it from its goal; taken for an offset, the press would grow until
+`max_bias`, to 100 N with G1, and bend wrists and whole robot aside."""
 
 
 class ArmDriver:
@@ -34,6 +40,8 @@ class ArmDriver:
         self.ik = ArmIk(morphology)
         self.bias = ArmBias(self.ik.joint_range, time_constant=BIAS_TIME)
         self._body = SteadyBody(morphology, self.ik.model)
+        self.load = ArmLoad(morphology)
+        self.hold = ArmHold()
         self._joints = [joint for arm in morphology.arms for joint in arm.joints]
         self.forget()
 
@@ -71,8 +79,15 @@ class ArmDriver:
             self._wanted = executed
             self.bias.reset()
             self._body.reset()
+            self.load.reset()
+            self.hold.reset()
         self._decided = frozenset(decided)
+        self.load.update(state.qpos, state.effort, dt)
         wrists = compute_wrist_goals(self._find_ik_goals(goal), head)
+        if len(wrists) == len(self.morphology.arms) == 2:  # noqa: PLR2004 a left and a right hand
+            left, right = (wrists[arm.frame][:3] for arm in self.morphology.arms)
+            self.hold.update(self.load.force, right - left)
+            wrists = self.hold.smooth(wrists, head, dt)
         # What the encoders of the body tremble by, the hands would make up for in earnest.
         body = self._body.update(state.qpos, state.command, dt)
         last, wanted = self._wanted, self.ik.solve(body, self._wanted, wrists, dt)
@@ -83,10 +98,19 @@ class ArmDriver:
             wanted[i] = np.clip(angle, executed[i] - reach, executed[i] + reach)
             planned[i] = True
         self._wanted = wanted
-        self.bias.update(state.qpos[self.ik.qpos_address] - executed, wanted - last, dt)
+        offset = state.qpos[self.ik.qpos_address] - executed
+        self.bias.update(offset, wanted - last, dt, self._compute_freedom())
         # The plan's prediction has the offset of the low-level policy in it.
         targets = np.where(planned, wanted, self.bias.compute_targets(wanted))
         return np.concatenate([targets, self.compute_grippers(goal)])
+
+    def _compute_freedom(self) -> np.ndarray:
+        """How freely each joint's arm moves, from 1 down to 0 for one that presses. Shape (n,)."""
+        freedom = np.ones(self.ik.num_joints)
+        gentle, hard = PRESSING
+        for part, force in zip(self.load.parts, self.load.force, strict=True):
+            freedom[part] = np.clip((hard - np.linalg.norm(force)) / (hard - gentle), 0, 1)
+        return freedom
 
     def _find_ik_goals(self, goal: Goal) -> dict[str, np.ndarray]:
         """Goals without those of the arms that the plan decides."""

@@ -47,6 +47,8 @@ class ArmIk:
         """Where the arm joints are in the robot's qpos. Shape (num_joints,), int."""
         self.joint_range = np.array([model.joint(joint).range for joint in joints])
         """Limits of the arm joints [rad]. Shape (num_joints, 2)."""
+        for joint, limits in morphology.arm_limits.items():
+            model.joint(joint).range = limits
         dofs = [int(model.joint(joint).dofadr[0]) for joint in joints]
         self._configuration = mink.Configuration(model)
         self._tasks = {

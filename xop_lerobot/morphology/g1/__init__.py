@@ -31,6 +31,10 @@ STANDING_HEIGHT = 0.7836
 ARM_REST = {"shoulder_pitch": 0.0, "shoulder_roll": 0.1, "elbow": 0.2}
 """Rest angles of the left arm [rad]: elbows at the sides, forearms forward, palms inward."""
 
+ELBOW_MIN = 0.1
+"""Most bent elbow of the arms' inverse kinematics [rad]; at 0 the forearm is square to the upper
+arm. Beyond it the low-level policy pushes the arms aside by 0.3 to 1 rad, and falls in the end."""
+
 
 def _mirrored(side: str, joint: str, angle: float) -> float:
     """Return a left-arm angle as it reads on `side`: roll and yaw change sign on the right."""
@@ -101,6 +105,7 @@ class G1(Morphology):
         for side in ("left", "right")
         for joint, angle in ARM_REST.items()
     }
+    arm_limits = {f"{side}_elbow_joint": (ELBOW_MIN, 2.0) for side in ("left", "right")}
     contact_points = tuple(
         f"{side}_foot_{i}" for side in ("left", "right") for i in range(len(FOOT_POINTS))
     )

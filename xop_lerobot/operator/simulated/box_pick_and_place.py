@@ -9,11 +9,13 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import SIDES
+from xop_lerobot.operator.simulated.body import SIDES, relaxed_hands
 from xop_lerobot.operator.simulated.hands import (
     compute_distance,
     compute_errors,
+    compute_reach,
     compute_wrist,
+    lean,
     look_at_work,
     move_hands,
     nudge,
@@ -49,19 +51,26 @@ ROBOT_LAG = 0.35
 """How much later than oneself a robot is known to move [s]."""
 PRESS = 0.03
 """Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
-SURE = 0.02
+SURE = 0.0
 """How much more than is just enough a person presses, to be sure [m]."""
-PRESS_MORE = 0.02
+PRESS_MORE = 0.01
 """How much more they press after a box has slipped [m]."""
 APPROACHES = 4
 """How often a person walks up to the box before giving up."""
+FARTHER = 0.055
+"""So much farther than for a touch the person stands from a box, to have elbows and waist free [m,
+robot]."""
+APART = 0.12
+"""So much farther apart than else the hands are when one walks up to a box [m]."""
+STAND_NEAR = 0.04
+"""How far beside where it wants to stand before the box is good enough [m]."""
 OUT_OF_REACH = 0.06
 """Palms that stay so far beside their places are out of reach [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""
-LIFT = 0.10
+LIFT = 0.06
 """How high the box is lifted [m]."""
-LIFTED = 0.05
+LIFTED = 0.035
 """Rise from which the person is sure to have lifted it [m]."""
 HOLD_S = 3.6
 """How long the lifted box is held [s]."""
@@ -71,7 +80,7 @@ LOST = 0.12
 """A box that far from the middle between the palms is not held [m]."""
 CARRY_SPEED = 0.06
 """Mean speed of hands that hold something [m/s]."""
-FIRMER = 0.015
+FIRMER = 0.012
 """How much further in hands are that hold a box while walking [m]."""
 STRAIGHTEN_S = 2.5
 """Time to stand up straight with a box [s]."""
@@ -126,12 +135,15 @@ def walk_to_box(mind: Mind) -> Doing:
     heading = choose_heading(mind, "box")
     box = mind.eyes.pose("box")[:3]
     ahead = compute_ahead(heading)
-    place = np.array([*(box - compute_distance(mind, [box]) * ahead)[:2], heading])
+    distance = compute_distance(mind, [box]) + FARTHER
+    place = np.array([*(box - distance * ahead)[:2], heading])
     miss, turn = compute_miss(mind, place)
-    if miss > mind.person.place_tolerance or abs(turn) > mind.person.heading_tolerance:
+    if miss > STAND_NEAR or abs(turn) > mind.person.heading_tolerance:
         yield from set_mode(mind, Mode.MOBILE)
         yield from glance(mind, "spot")
-        yield from go_to(mind, place)
+        hands = relaxed_hands(mind.person.size)
+        hands[:, 1] += [APART, -APART]
+        yield from go_to(mind, place, hands=hands, tolerance=STAND_NEAR)
     yield from set_mode(mind, Mode.STATIONARY)
 
 
@@ -183,6 +195,7 @@ def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
     """
     box = mind.eyes.pose("box")[:3]
     yield from take_posture(mind, plan_posture(mind, [box]))
+    yield from keep_distance(mind)
     press = mind.eyes.recall("press", PRESS)
     for attempt in range(GRASPS):
         yield from bring_beside(mind)
@@ -200,6 +213,16 @@ def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
         yield from shift_hands(mind, np.array([0, 0, -LIFT]), CARRY_SPEED)
         yield from open_hands(mind)
     raise GaveUp("the box slips out of the hands")
+
+
+def keep_distance(mind: Mind) -> Doing:
+    """Lean back, or ahead, to have the box at the distance at which arms work well."""
+    head, box = mind.eyes.pose("head"), mind.eyes.pose("box")
+    ahead = compute_ahead(compute_heading(head[3:]))
+    error = float((box - head)[:3] @ ahead) - compute_reach(mind) - FARTHER
+    mind.note(f"box {100 * error:.0f} cm too far")
+    if abs(error) > 0.5 * STAND_NEAR:
+        yield from lean(mind, {"both": error * ahead})
 
 
 def bring_beside(mind: Mind) -> Doing:
@@ -322,7 +345,7 @@ def walk_to_table(mind: Mind) -> Doing:
     head = mind.eyes.pose("head")
     heading = compute_heading(head[3:])
     back = np.array([*(head[:3] - BACK * compute_ahead(heading))[:2], heading])
-    yield from go_to(mind, back, hands=hands, tolerance=0.15, tries=2)
+    yield from go_to(mind, back, hands=hands, laden=True, tolerance=0.15, tries=2)
     yield from find(mind, "spot")
     for _ in range(3):
         check_held(mind)
@@ -331,20 +354,20 @@ def walk_to_table(mind: Mind) -> Doing:
         miss, _ = compute_miss(mind, place)
         if miss <= PLACE_NEAR:
             break
-        yield from go_to(mind, place, hands=hands, tolerance=PLACE_NEAR, tries=3)
+        yield from go_to(mind, place, hands=hands, laden=True, tolerance=PLACE_NEAR, tries=3)
     yield from set_mode(mind, Mode.STATIONARY)
 
 
 def straighten_up(mind: Mind) -> Doing:
     """Stand upright with the box before oneself, and hold it more firmly, before walking."""
     body, last = mind.body, mind.body.posture
-    hands = last.hands.copy()
-    across = hands[0][:3] - hands[1][:3]
+    room = body.compute_hands_in_room()
+    across = room[0][:3] - room[1][:3]
     across /= np.linalg.norm(across)
     for i in range(2):
-        hands[i][:3] -= (1 - 2 * i) * FIRMER / mind.belief.scale * across
-    end = replace(last, drop=0.0, lean=np.zeros(2), look=np.zeros(2), hands=hands)
-    body.move(end, STRAIGHTEN_S)
+        room[i][:3] -= (1 - 2 * i) * FIRMER / mind.belief.scale * across
+    end = replace(last, drop=0.0, lean=np.zeros(2), look=np.zeros(2))
+    body.move(body.with_hands_in_room(end, dict(zip(SIDES, room, strict=True))), STRAIGHTEN_S)
     yield from mind.settle()
     check_held(mind)
 

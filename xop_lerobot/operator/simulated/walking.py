@@ -86,6 +86,7 @@ def go_to(
     *,
     tolerance: float | None = None,
     hands: np.ndarray | None = None,
+    laden: bool = False,
     tries: int = 8,
 ) -> Doing:
     """Walk until the robot's head is at a place, x y yaw of the robot's world.
@@ -98,11 +99,11 @@ def go_to(
         place: Where the robot's head shall be, and its heading.
         tolerance: How far beside it is good enough [m].
         hands: Wrists while walking, from the head (2, 7); relaxed in front by default.
+        laden: Whether they carry something: then slowly, and bent as it may bend a robot.
         tries: Most legs.
     """
     person = mind.person
     near = person.place_tolerance if tolerance is None else tolerance
-    laden = hands is not None  # what is carried bends a robot too
     hands = relaxed_hands(person.size) if hands is None else hands
     yield from mind.settle()
     stuck = 0
