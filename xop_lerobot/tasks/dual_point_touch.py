@@ -61,7 +61,7 @@ class DualPointTouch(Task):
 
     name = "dual_point_touch"
     instruction = "Touch the red point with the left palm and the blue one with the right."
-    time_limit = 60.0
+    time_limit = 90.0
     scenes: Mapping[str, str] = {"g1": "empty", "rby1": "small_room"}
 
     def __init__(self, morphology: Morphology) -> None:
