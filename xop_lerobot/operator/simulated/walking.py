@@ -22,6 +22,10 @@ MODE_TRIES = 6
 """How often a person tries a double pinch before giving up."""
 MOST_STUCK = 3
 """How often a person tries to go on with a robot that strains."""
+LENIENT = (4, 1.5)
+"""After so many legs a person has to do with so many times the usual tolerance."""
+BRIDGED = 0.2
+"""Way that is left to arms and a lean, where a robot does not come any nearer [m]."""
 STRAIN = (0.06, 0.2)
 """Difference of height [m] and of tilt [rad] to the own head from which a robot strains."""
 LADEN = 0.5
@@ -109,6 +113,8 @@ def go_to(
     stuck = 0
     for leg in range(tries):
         miss, turn = compute_miss(mind, place)
+        if leg >= LENIENT[0]:
+            near = max(near, LENIENT[1] * person.place_tolerance)
         if miss <= near and abs(turn) <= person.heading_tolerance:
             return
         own, seen, turn_then = mind.body.posture.place, mind.eyes.pose("head"), mind.belief.turn
@@ -121,7 +127,9 @@ def go_to(
         if is_strained(mind) and not laden:
             yield from _come_back(mind, own, seen, turn_then)
             stuck += 1
-            if stuck >= MOST_STUCK:
+            miss, turn = compute_miss(mind, place)
+            bridged = miss <= BRIDGED and abs(turn) <= 2 * person.heading_tolerance
+            if stuck >= MOST_STUCK or bridged:
                 return
 
 
