@@ -26,9 +26,10 @@ BOX = (0.08, 0.13, 0.10)
 """Half the edges of the box: deep, wide, high [m]."""
 BOX_MASS = 0.6
 """A cardboard box with little in it [kg]."""
-BOX_FRICTION = (0.7, 0.02, 0.001)
-"""Cardboard on the rubber of hands and mats: sliding 0.5 to 0.8 in tables of friction; torsion
-over patches of some centimetres [m], rolling [m]."""
+BOX_FRICTION = (0.9, 0.02, 0.001)
+"""Cardboard on hands with rubber palms and on rubber mats, chosen: 0.5 to 0.8 in tables of friction
+for rubber on cardboard, about 1 for soft rubber on dry paper; torsion over patches of some
+centimetres [m], rolling [m]."""
 COMPLIANCE = (0.04, 1.0)
 """MuJoCo's time constant [s] and damping ratio of its contacts: a side of the box and the rubber
 of a hand give by about a centimetre under 100 N. Stiffer ones let the grip of a stiff arm go from

@@ -80,7 +80,7 @@ LOST = 0.12
 """A box that far from the middle between the palms is not held [m]."""
 CARRY_SPEED = 0.06
 """Mean speed of hands that hold something [m/s]."""
-FIRMER = 0.012
+FIRMER = 0.02
 """How much further in hands are that hold a box while walking [m]."""
 STRAIGHTEN_S = 2.5
 """Time to stand up straight with a box [s]."""
