@@ -286,3 +286,16 @@ def test_a_goal_behind_the_back_is_waited_for(rby1, planner):
     assert route.share == 1
     assert route.turns[0] == pytest.approx(2.2 - (math.tau - 3.0), abs=1e-6)
     assert route.turns[-1] == pytest.approx(0, abs=1e-9)
+
+
+def test_the_base_turns_with_a_goal_that_turns(rby1, planner):
+    """A waist twisted by 1 rad may stay so at rest; behind a person who turns it may not."""
+    qpos, head = place(rby1)
+    head = pose_multiply(head, make_pose([0, 0, 0], quat_from_yaw(1.0)))
+    turned = [
+        planner.plan(qpos, (0.0, 0.0), "head", head, head, 2.0, turn_rate=rate).headings[-1]
+        for rate in (0.0, 0.25, 0.35, 1.0)
+    ]
+    assert turned[0] == 0
+    assert turned[-1] > 0.3
+    assert sorted(turned) == turned

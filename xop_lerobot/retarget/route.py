@@ -23,7 +23,7 @@ _BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
 _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
 _MAX_TWIST = 1.9  # largest twist of the waist in which the robot arrives [rad]
 _WAIST_LIMIT, _WAIST_SPEED = 2.2, 1.5  # of the waist that turns the head [rad], [rad/s]
-_TURNING = 0.3  # yaw rate from which a goal counts as turning [rad/s]
+_RESTING, _TURNING = 0.15, 0.45  # yaw rates of a goal that rests and of one that turns [rad/s]
 _TURNING_TWIST = 0.6  # largest twist of the waist behind such a goal [rad]
 _TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
 _CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
@@ -161,7 +161,8 @@ class RoutePlanner:
             aim = _Aim(gx, gy, heading, 0.0, carried)
         else:
             carried = (self._resting[name] - self._pivot, 0.0)
-            twist = _MAX_TWIST if abs(turn_rate) < _TURNING else _TURNING_TWIST
+            turning = min(max((abs(turn_rate) - _RESTING) / (_TURNING - _RESTING), 0.0), 1.0)
+            twist = _MAX_TWIST + turning * (_TURNING_TWIST - _MAX_TWIST)
             aim = _Aim(gx, gy, float(quat_yaw(goal[3:])), twist, carried)
         count = math.ceil(duration / _DT) + 1
         way = _simulate(aim, x, y, heading, speeds, count)
