@@ -14,15 +14,26 @@ from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.plan import Plan, Retargeter
 from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
 from xop_lerobot.state import Goal, RobotState
-from xop_lerobot.transforms import quat_yaw
+from xop_lerobot.transforms import (
+    make_pose,
+    quat_from_yaw,
+    quat_multiply,
+    quat_yaw,
+    wrap_angle,
+)
+
+_UPRIGHT = 0.99  # share of a joint's axis that is vertical, where it turns what is above it
 
 
 class DirectRetargeter(Retargeter):
     """Maps the head's height and orientation by kinematics, and its velocity as it is.
 
     Height and torso come from inverse kinematics of the goal's height and orientation, with the
-    base where it stands; the base's velocities are the goal's own, in its heading. Nothing
-    closes the loop on the position, so the robot drifts: that is what the baseline shows.
+    base where it stands; the base's velocities are the head's own, along and across the head's
+    heading: who walks ahead makes the robot walk ahead, wherever the two look by now. Nothing
+    closes the loop on place or heading, so the robot drifts: that is what the baseline shows.
+    A heading that the waist has no part in, or cannot reach, is left to the yaw rate; else waist
+    roll and pitch would be bent for what is left of it.
 
     Args:
         morphology: The robot.
@@ -40,6 +51,7 @@ class DirectRetargeter(Retargeter):
         self.proposal = KinematicProposal(
             model, self.command_model, {"head": site}, ProposalWeights(position=(0.0, 0.0, 1.0))
         )
+        self._turns_waist = _find_vertical_joints(morphology, model)
         self._last = self.space.neutral
 
     def control_period(self, mode: Mode) -> float:
@@ -60,7 +72,7 @@ class DirectRetargeter(Retargeter):
             # Long enough for the lags to die out: the mapping is static.
             command = self.proposal.solve(
                 state.qpos,
-                {"head": goal.poses["head"]},
+                {"head": self._turn_to_base(state, goal)},
                 goal.mode,
                 dt=2.0,
                 start=self._last,
@@ -72,14 +84,35 @@ class DirectRetargeter(Retargeter):
         solve = perf_counter() - start
         return Plan(command, command[None], goal.mode, timings={"solve": solve})
 
+    def _turn_to_base(self, state: RobotState, goal: Goal) -> np.ndarray:
+        """The head's goal, turned about the vertical to where the waist can look. Shape (7,)."""
+        pose, base = goal.poses["head"], float(quat_yaw(state.qpos[3:7]))
+        beside = float(wrap_angle(quat_yaw(pose[3:]) - base))
+        waist = self._turns_waist & self.command_model.acting(goal.mode)
+        low, high = self.space.low[waist].sum(), self.space.high[waist].sum()
+        back = float(np.clip(beside, low, high)) - beside
+        return make_pose(pose[:3], quat_multiply(quat_from_yaw(back), pose[3:]))
+
     def _map_velocity(self, state: RobotState, goal: Goal) -> np.ndarray:
-        """The goal's velocity in the heading of the base, on the entries it belongs to. (k,)."""
+        """The head's velocity in its own heading, on the entries it belongs to. Shape (k,)."""
         velocity = goal.velocities.get("head", np.zeros(6))
-        yaw = quat_yaw(state.qpos[3:7])
+        if goal.mode is Mode.STATIONARY or "head" not in goal.poses:
+            return self.space.neutral
+        yaw = quat_yaw(goal.poses["head"][3:])
         forward = np.cos(yaw) * velocity[0] + np.sin(yaw) * velocity[1]
         left = np.cos(yaw) * velocity[1] - np.sin(yaw) * velocity[0]
-        if goal.mode is Mode.STATIONARY:
-            return self.space.neutral
         values = {Acts.FORWARD: forward, Acts.LEFT: left, Acts.TURN: velocity[5]}
         command = np.array([values.get(e.acts, 0.0) for e in self.command_model.effects])
         return np.where(self.command_model.acting(goal.mode), command, self.space.neutral)
+
+
+def _find_vertical_joints(morphology: Morphology, model: mujoco.MjModel) -> np.ndarray:
+    """Which entries of the command turn a joint that stands upright. Shape (k,), bool."""
+    data = mujoco.MjData(model)
+    data.qpos[: len(morphology.standing_qpos())] = morphology.standing_qpos()
+    mujoco.mj_kinematics(model, data)
+    upright = [
+        effect.acts is Acts.JOINT and abs(data.xaxis[model.joint(effect.joint).id, 2]) > _UPRIGHT
+        for effect in morphology.effects
+    ]
+    return np.array(upright)

@@ -1,0 +1,75 @@
+"""The direct mapping: what the head does, the robot is told to do, wherever it stands by now."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from xop_lerobot.command import Mode
+from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.direct import DirectRetargeter
+from xop_lerobot.state import Goal
+from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_from_yaw, quat_multiply
+
+
+@pytest.fixture(scope="module", params=["g1", "rby1"])
+def robot(request):
+    morphology = make_morphology(request.param)
+    plant = Simulation(morphology, kind="planning")
+    loop = PolicyLoop(morphology, plant, make_policy(morphology.policies[0], None))
+    loop.reset(0)
+    state = loop.state
+    head = plant.get_site_pose(morphology.frames["head"])
+    return morphology, plant.model, state, head
+
+
+def plan(robot, pose, velocity=(0, 0, 0, 0, 0, 0), mode=Mode.MOBILE):
+    morphology, model, state, _ = robot
+    retargeter = DirectRetargeter(morphology, model)
+    retargeter.reset(state)
+    goal = Goal({"head": pose}, {"head": np.array(velocity, dtype=float)}, mode)
+    command = retargeter.plan(state, goal).command
+    return dict(zip(morphology.command_space.names, command, strict=True))
+
+
+def turned(robot, yaw):
+    head = robot[3]
+    return make_pose(head[:3], quat_multiply(quat_from_yaw(yaw), head[3:]))
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.8, 2.5])
+def test_who_walks_ahead_makes_the_robot_walk_ahead(robot, yaw):
+    """Also where the robot has drifted and looks elsewhere than the person."""
+    velocity = (0.4 * np.cos(yaw), 0.4 * np.sin(yaw), 0, 0, 0, 0.1)
+    command = plan(robot, turned(robot, yaw), velocity)
+    assert command["vx" if "vx" in command else "v"] == pytest.approx(0.4, abs=0.02)
+    assert command.get("vy", 0.0) == pytest.approx(0, abs=0.02)
+    assert command["yaw_rate"] == pytest.approx(0.1)
+    standing = plan(robot, turned(robot, yaw), velocity, Mode.STATIONARY)
+    assert standing["yaw_rate"] == 0
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_a_heading_out_of_reach_bends_nothing(robot, mode):
+    """Roll and pitch of the waist are not used up for a heading that it cannot turn to."""
+    straight = plan(robot, turned(robot, 0.0), mode=mode)
+    away = plan(robot, turned(robot, 2.8), mode=mode)
+    waist = {"waist_yaw", "torso_5"}
+    for name, value in straight.items():
+        if name not in waist:
+            assert away[name] == pytest.approx(value, abs=0.06), name
+
+
+def test_a_lean_is_a_lean_wherever_the_robot_looks(robot):
+    """The head's pitch, in its own heading, becomes the robot's."""
+    lean = quat_from_rpy(0.0, 0.2, 0.0)
+    head = robot[3]
+    bent = make_pose(head[:3], quat_multiply(head[3:], lean))
+    there = make_pose(head[:3], quat_multiply(quat_from_yaw(2.8), bent[3:]))
+    here, away = plan(robot, bent), plan(robot, there)
+    for name in ("waist_pitch", "waist_roll"):
+        if name in here:
+            assert away[name] == pytest.approx(here[name], abs=0.03)
