@@ -73,3 +73,17 @@ def test_a_lean_is_a_lean_wherever_the_robot_looks(robot):
     for name in ("waist_pitch", "waist_roll"):
         if name in here:
             assert away[name] == pytest.approx(here[name], abs=0.03)
+
+
+def test_what_drifted_in_motion_does_not_turn_the_waist_at_rest(robot):
+    """The switch to standing makes no step: the waist turns from there on."""
+    morphology, model, state, _ = robot
+    retargeter = DirectRetargeter(morphology, model)
+    retargeter.reset(state)
+    name = "waist_yaw" if "waist_yaw" in morphology.command_space.names else "torso_5"
+    index = morphology.command_space.index(name)
+    moving = retargeter.plan(state, Goal({"head": turned(robot, 0.8)}, mode=Mode.MOBILE))
+    standing = retargeter.plan(state, Goal({"head": turned(robot, 0.8)}))
+    assert standing.command[index] == pytest.approx(moving.command[index], abs=0.02)
+    looking = retargeter.plan(state, Goal({"head": turned(robot, 1.2)}))
+    assert looking.command[index] - standing.command[index] == pytest.approx(0.4, abs=0.05)

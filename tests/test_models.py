@@ -84,7 +84,8 @@ def test_importing_the_robots_loads_no_mujoco() -> None:
 def test_unknown_names_list_the_choices() -> None:
     with pytest.raises(UnknownName, match="unknown robot 'atlas'. Known: g1, rby1"):
         make_morphology("atlas")
-    with pytest.raises(UnknownName, match="unknown scene 'moon'. Known: empty, room, tabletop"):
+    known = "empty, room, small_room, tabletop"
+    with pytest.raises(UnknownName, match=f"unknown scene 'moon'. Known: {known}"):
         build_model(make_morphology("g1"), "full", "moon")
 
 

@@ -53,6 +53,7 @@ class DirectRetargeter(Retargeter):
         )
         self._turns_waist = _find_vertical_joints(morphology, model)
         self._last = self.space.neutral
+        self._drifted = 0.0  # heading that the waist had no part in when last in motion [rad]
 
     def control_period(self, mode: Mode) -> float:
         """Time between two plans [s]."""
@@ -61,7 +62,7 @@ class DirectRetargeter(Retargeter):
 
     def reset(self, state: RobotState) -> None:
         """Start from the command that `state` executes."""
-        self._last = state.command
+        self._last, self._drifted = state.command, 0.0
 
     def plan(self, state: RobotState, goal: Goal) -> Plan:
         """Compute the command for `goal`; `state` gives the base's heading and place."""
@@ -90,7 +91,11 @@ class DirectRetargeter(Retargeter):
         beside = float(wrap_angle(quat_yaw(pose[3:]) - base))
         waist = self._turns_waist & self.command_model.acting(goal.mode)
         low, high = self.space.low[waist].sum(), self.space.high[waist].sum()
-        back = float(np.clip(beside, low, high)) - beside
+        if goal.mode is Mode.MOBILE:  # what the waist has no part in, the yaw rate has to do
+            self._drifted = beside - float(np.clip(beside, low, high))
+        beside = float(np.clip(wrap_angle(beside - self._drifted), low, high))
+        wanted = base + beside
+        back = wanted - float(quat_yaw(pose[3:]))
         return make_pose(pose[:3], quat_multiply(quat_from_yaw(back), pose[3:]))
 
     def _map_velocity(self, state: RobotState, goal: Goal) -> np.ndarray:
