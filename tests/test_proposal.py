@@ -463,19 +463,20 @@ def test_direct_maps_the_height_and_ignores_the_place(parts):
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.2, -2.5])
-def test_direct_maps_the_velocity_in_the_heading_of_the_base(parts, yaw):
+def test_direct_maps_the_velocity_in_the_heading_of_the_head(parts, yaw):
+    """Wherever the base has drifted to."""
     p = parts["g1"]
     direct = DirectRetargeter(p.morphology, p.model)
-    qpos = p.qpos.copy()
-    qpos[3:7] = quat_from_yaw(yaw)
-    state = make_state(p, qpos)
+    state = make_state(p, p.qpos)
     direct.reset(state)
     velocity = np.zeros(6)
     velocity[:3] = quat_rotate(quat_from_yaw(yaw), np.array([0.4, -0.1, 0.0]))
     velocity[5] = 0.3
-    goal = Goal({"head": p.reach(p.space.neutral, Mode.MOBILE)}, {"head": velocity}, Mode.MOBILE)
+    head = p.reach(p.space.neutral, Mode.MOBILE)
+    head[3:] = quat_multiply(quat_from_yaw(yaw), head[3:])
+    goal = Goal({"head": head}, {"head": velocity}, Mode.MOBILE)
     plan = direct.plan(state, goal)
-    np.testing.assert_allclose(plan.command[-3:], [0.4, -0.1, 0.3], atol=1e-9)
+    np.testing.assert_allclose(plan.command[-3:], [0.4, -0.1, 0.3], atol=5e-3)
     assert plan.mode is Mode.MOBILE
     np.testing.assert_array_equal(plan.commands, [plan.command])
     standing = direct.plan(state, Goal(goal.poses, goal.velocities, Mode.STATIONARY))
