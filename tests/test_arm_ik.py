@@ -121,8 +121,9 @@ def test_the_hands_stay_in_the_world_while_the_body_moves(arms, solvers, name):
     a, ik = arms[name], solvers[name]
     goals = a.compute_wrists(a.rest)
     angles, qpos = a.rest, a.qpos.copy()
+    drop = 0.03 if a.morphology.arm_limits else 0.05  # elbows that may not bend end sooner
     for tick in range(50):
-        qpos[2] = a.qpos[2] - 0.03 * np.sin(0.1 * tick)
+        qpos[2] = a.qpos[2] - drop * np.sin(0.1 * tick)
         qpos[3:7] = quat_from_rpy(0.02 * np.sin(0.2 * tick), 0, 0.1 * np.sin(0.1 * tick))
         angles = ik.solve(qpos, angles, goals, DT)
         wrists = a.compute_wrists(angles, qpos)
