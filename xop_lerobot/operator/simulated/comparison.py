@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.operator.recording import load_recording
 from xop_lerobot.operator.simulated.body import SIDES, Body
 from xop_lerobot.operator.simulated.hands import compute_reach_time
@@ -125,13 +124,6 @@ def compute_spectrum(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     power = (np.abs(np.fft.rfft(velocity * window, axis=0)) ** 2).sum(axis=1)
     frequency = np.fft.rfftfreq(len(velocity), 1 / RATE)
     return frequency[1:], 2 * power[1:] / (RATE * float((window**2).sum()))
-
-
-def compute_standing_sway(seed: int, duration: float = 60.0) -> np.ndarray:
-    """RMS of the head's sway forward, sideways and up while standing [m]. Shape (3,)."""
-    noise = HumanNoise(seed)
-    heads = np.array([noise.at(t).head for t in np.arange(0, duration, 1 / RATE)])
-    return heads.std(axis=0)
 
 
 def _make_motion(name: str, frames: list[OperatorFrame], *, simulated: bool) -> Motion:
