@@ -21,13 +21,16 @@ IDENTITY = np.array([1.0, 0, 0, 0])
 
 
 def make_body(head_height: float = 1.21) -> dict[str, np.ndarray]:
-    """Head and wrists of a robot that stands at the origin. Shapes (7,)."""
+    """Head, wrists and palms of a robot that stands at the origin. Shapes (7,)."""
     head = make_pose(np.array([0, 0, head_height]), IDENTITY)
     wrists = {
         f"{side}_wrist": make_pose(np.array([0.15, y, head_height - 0.42]), IDENTITY)
         for side, y in (("left", 0.18), ("right", -0.18))
     }
-    return {"head": head, **wrists}
+    palms = {
+        f"{side}_palm": pose_multiply(wrists[f"{side}_wrist"], PALM) for side in ("left", "right")
+    }
+    return {"head": head, **wrists, **palms}
 
 
 @dataclass
