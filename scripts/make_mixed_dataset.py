@@ -1,0 +1,371 @@
+"""Make a small dataset of mixed episodes and two killed sessions, to try `xop-curate` on.
+
+    .venv/bin/python scripts/make_mixed_dataset.py --out outputs/mixed
+
+A G1 in simulation follows a made-up person who crouches and stands up again: some do it well, some
+not deeply enough, some robots are pushed over, some headsets lose track, some people stand about
+before or after. No planner runs (`--teleop.retargeter.type=direct`) and the pictures are tiny, so
+that 30 episodes take about a minute. The same seed makes the same episodes.
+
+    OUT/session        the episodes, as `xop-record` writes them
+    OUT/kinds.json     what each of them is: success, failure, fall, tracking_loss, idle_start, …
+    OUT/killed         a session of `xop-record`, killed (`kill -9`) in the middle of an episode
+    OUT/killed_stock   the same with LeRobot's own recorder: parquet files without an end
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from tqdm import tqdm
+
+from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from lerobot_robot_xop.xop_robot import XopRobot
+    from xop_lerobot.dataset.xop_dataset import XopDataset
+    from xop_lerobot.operator.view import SeenObject
+    from xop_lerobot.plant.simulation import Simulation
+
+FPS = 25
+RATE_HZ = 50
+KILLED_EPISODES = 3
+"""Episodes that a killed session had saved."""
+SESSION = "mixed"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of episode.
+
+    Attributes:
+        depth: How far the person crouches [m].
+        idle_start: How long the person stands still before [s].
+        idle_end: How long the person stands still after [s].
+        lost: Limbs (head, left wrist, right wrist) that the headset loses on the way down.
+        lost_s: For how long [s].
+        push: Force that throws the robot over [N].
+    """
+
+    depth: float = 0.28
+    idle_start: float = 0.2
+    idle_end: float = 0.2
+    lost: tuple[int, ...] = ()
+    lost_s: float = 0.0
+    push: float = 0.0
+
+
+KINDS: Mapping[str, Kind] = {
+    "success": Kind(),
+    "failure": Kind(depth=0.05),
+    "fall": Kind(push=900.0),
+    "tracking_loss": Kind(lost=(0, 1), lost_s=0.8),
+    "idle_start": Kind(idle_start=2.0),
+    "idle_both": Kind(idle_start=1.4, idle_end=1.6),
+}
+ORDER = (
+    "success", "failure", "success", "idle_start", "success", "fall", "success", "tracking_loss",
+    "success", "idle_both",
+)  # fmt: skip
+"""Kinds of ten episodes on end; after them it begins again."""
+
+
+@TASKS.register("crouch")
+class Crouch(Task):
+    """Lower the head by 12 cm and bring it back up to within 5 cm."""
+
+    name = "crouch"
+    instruction = "crouch and stand up again"
+    time_limit = 20.0
+    push: ClassVar[float] = 0.0
+    """Force on the trunk from 1.0 s to 1.3 s after the start [N]; a switch of this script's."""
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add nothing."""
+
+    def bind(self, plant: Simulation) -> None:
+        """Remember the plant."""
+        self._plant = plant
+        self._trunk = plant.model.body(self.morphology.base_body).id
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Start over."""
+        del rng
+        self._start, self._begin = self._height, self._plant.time
+        self._was_low = self._success = False
+
+    @property
+    def _height(self) -> float:
+        return float(self._plant.get_site_pose(self.morphology.frames["head"])[2])
+
+    def update(self) -> TaskStatus:
+        """See how deep the head is, and push the robot where that is asked for."""
+        lowered = self._start - self._height
+        self._was_low |= lowered > 0.12
+        self._success |= self._was_low and lowered < 0.05 and not self._plant.has_fallen
+        pushed = 1.0 < self._plant.time - self._begin < 1.3
+        self._plant.data.xfrc_applied[self._trunk, 0] = self.push if pushed else 0.0
+        return TaskStatus(success=self._success and not self._plant.has_fallen, done=False)
+
+    @property
+    def objects(self) -> Mapping[str, SeenObject]:
+        """Nothing to see."""
+        return {}
+
+
+def make_motion(kind: Kind, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Make an operator recording of one kind: stand, crouch, stand up, stand.
+
+    Returns:
+        The arrays of an operator recording (docs/operator.md), at 50 Hz.
+    """
+    down, low, up = rng.uniform(0.7, 1.0), rng.uniform(0.1, 0.3), rng.uniform(0.7, 1.0)
+    depth = kind.depth * rng.uniform(0.9, 1.1)
+    marks = np.cumsum([kind.idle_start + rng.uniform(0, 0.1), down, low, up, kind.idle_end])
+    t = np.arange(0.0, marks[-1], 1 / RATE_HZ)
+    lowered = depth * (_rise(t, marks[0], down) - _rise(t, marks[2], up))
+
+    def sway(size: float) -> np.ndarray:
+        """Slow movement of somebody who stands; published for quiet standing, docs/operator.md."""
+        rates, phases = rng.uniform(0.1, 0.6, 3), rng.uniform(0, 2 * np.pi, 3)
+        return size * np.sin(2 * np.pi * rates * t[:, None] + phases)
+
+    pose = np.tile([0.0, 0, 1.6, 1, 0, 0, 0], (len(t), 1))
+    pose[:, :3] += sway(0.002)
+    pose[:, 2] -= lowered
+    motion = {"t": t, "head_pose": pose}
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        wrist = pose + [0.3, y, -0.45, 0, 0, 0, 0]
+        wrist[:, :3] += sway(0.001)
+        wrist[:, 0] += 0.5 * lowered
+        motion |= {f"{side}_wrist_pose": wrist, f"{side}_pinch": np.full(len(t), 0.08)}
+    motion["tracked"] = np.ones((len(t), 3), bool)
+    if kind.lost:
+        gone = (t >= marks[0] + 0.2) & (t < marks[0] + 0.2 + kind.lost_s)
+        motion["tracked"][np.ix_(gone, kind.lost)] = False
+    return motion
+
+
+def _rise(t: np.ndarray, start: float, duration: float) -> np.ndarray:
+    """Movement of minimum jerk from 0 to 1. Shape (T,)."""
+    s = np.clip((t - start) / duration, 0, 1)
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+class Recorder:
+    """Records single episodes of given kinds into one dataset.
+
+    Args:
+        root: Directory of the dataset, which must not exist.
+        seed: Seed of all that is random.
+        size: Width and height of a picture [pixel].
+    """
+
+    def __init__(self, root: Path, seed: int, size: tuple[int, int]) -> None:
+        from lerobot.configs.video import RGBEncoderConfig
+
+        from lerobot_robot_xop.config_xop import XopG1Config
+        from lerobot_robot_xop.xop_robot import XopG1
+        from xop_lerobot.dataset.record import build_features
+        from xop_lerobot.dataset.xop_dataset import XopDataset
+        from xop_lerobot.link import get_session
+
+        self._seed, self._session = seed, get_session(SESSION)
+        self.robot: XopRobot = XopG1(
+            XopG1Config(
+                session=SESSION, fps=FPS, seed=seed, task="crouch", width=size[0], height=size[1]
+            )
+        )
+        self.robot.connect()
+        self._teleop = self._make_teleop("unused")
+        self.dataset: XopDataset = XopDataset.bind(SESSION).create(
+            f"local/{root.name}",
+            FPS,
+            build_features(self.robot, use_videos=True),
+            root=root,
+            robot_type=self.robot.name,
+            rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="ultrafast"),
+            encoder_threads=1,
+            streaming_encoding=True,
+        )
+
+    def _make_teleop(self, path: str) -> Any:
+        from lerobot_teleoperator_xop import Xop, XopConfig
+        from xop_lerobot.operator.devices.config import DeviceConfig
+        from xop_lerobot.retarget.config import RetargeterConfig
+
+        teleop = Xop(
+            XopConfig(
+                session=SESSION,
+                device=DeviceConfig(type="replay", path=path, hold_s=0.2),
+                retargeter=RetargeterConfig(type="direct"),
+            )
+        )
+        teleop.host.remove()
+        return teleop
+
+    def record(self, index: int, name: str, ticks: int | None = None) -> None:
+        """Record episode `index` of the kind `name`, or its first `ticks` without saving it."""
+        from xop_lerobot.dataset.tick import run_tick
+
+        rng = np.random.default_rng([self._seed, index])
+        Crouch.push = KINDS[name].push
+        self._session.begin_episode(index)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "person.npz"
+            np.savez(path, **make_motion(KINDS[name], rng))
+            teleop = self._make_teleop(str(path))
+            teleop.connect()
+        events = {"exit_early": False}
+        self.dataset.begin(events, ticks)
+        try:
+            while not events["exit_early"]:
+                run_tick(self.robot, teleop, self.dataset, Crouch.instruction)
+        finally:
+            teleop.disconnect()
+        if ticks is None:
+            self.dataset.save_episode()
+
+    def close(self) -> None:
+        """Close the files and let go of the robot."""
+        self.dataset.finalize()
+        self.robot.disconnect()
+
+
+@contextlib.contextmanager
+def open_recorder(root: Path, seed: int, size: tuple[int, int]) -> Iterator[Recorder]:
+    """Open a recorder and close it again."""
+    recorder = Recorder(root, seed, size)
+    try:
+        yield recorder
+    finally:
+        recorder.close()
+
+
+def make_killed(root: Path, seed: int, size: tuple[int, int]) -> None:
+    """Record a session and kill this process in the middle of its last episode."""
+    recorder = Recorder(root, seed, size)
+    for index in range(KILLED_EPISODES):
+        recorder.record(index, ORDER[index])
+    recorder.record(KILLED_EPISODES, "success", ticks=20)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def make_killed_stock(source: Path, root: Path) -> None:
+    """Record the episodes of `source` anew with LeRobot's own class, and kill this process."""
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.utils.constants import DEFAULT_FEATURES
+
+    from xop_lerobot.dataset.columns import is_own_column
+
+    frames = LeRobotDataset(f"local/{source.name}", root=source)
+    features = {
+        key: {name: spec[name] for name in ("dtype", "shape", "names")}
+        for key, spec in frames.meta.features.items()
+        if key not in DEFAULT_FEATURES and not is_own_column(key)
+    }
+    copy = LeRobotDataset.create(
+        f"local/{root.name}",
+        FPS,
+        features,
+        root=root,
+        robot_type=frames.meta.robot_type,
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="ultrafast"),
+    )
+    for row in range(frames.num_frames):
+        item = frames[row]
+        episode, frame = int(item["episode_index"]), int(item["frame_index"])
+        if frame == 0 and row:
+            copy.save_episode()
+        if episode == KILLED_EPISODES and frame == 20:
+            break
+        values = {key: np.asarray(item[key]) for key in features}
+        for key, spec in features.items():
+            if spec["dtype"] == "video":
+                values[key] = np.round(values[key] * 255).astype(np.uint8).transpose(1, 2, 0)
+        copy.add_frame({**values, "task": item["task"]})
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def main() -> int:
+    """Make it all; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="directory for all of it")
+    parser.add_argument("--episodes", type=int, default=30, help="episodes of the whole session")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all that is random")
+    parser.add_argument("--width", type=int, default=48, help="of a picture [pixel]")
+    parser.add_argument("--height", type=int, default=36, help="of a picture [pixel]")
+    parser.add_argument("--only-session", action="store_true", help="leave the killed ones out")
+    parser.add_argument("--die", choices=("xop", "stock"), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    _calm_down()
+    size, session = (args.width, args.height), args.out / "session"
+    try:
+        if args.die == "xop":
+            make_killed(args.out / "killed", args.seed + 1, size)
+        elif args.die == "stock":
+            make_killed_stock(session, args.out / "killed_stock")
+        make_all(args, session, size)
+    except XopError as error:
+        sys.exit(f"error: {error}")
+    return 0
+
+
+def _calm_down() -> None:
+    """Leave out what encoders tell of themselves."""
+    import av.logging
+
+    av.logging.set_libav_level(av.logging.ERROR)
+
+
+def make_all(args: argparse.Namespace, session: Path, size: tuple[int, int]) -> None:
+    """Make the whole session, then let two more be killed.
+
+    Raises:
+        BadValue: If there are too few episodes, or the directory holds something.
+    """
+    least = KILLED_EPISODES + 1
+    if args.episodes < least:
+        raise BadValue(f"--episodes must be at least {least}, got {args.episodes}")
+    if args.out.exists() and any(args.out.iterdir()):
+        raise BadValue(f"'{args.out}' is not empty. Choose another --out, or delete it")
+    kinds = [ORDER[index % len(ORDER)] for index in range(args.episodes)]
+    try:
+        with open_recorder(session, args.seed, size) as recorder:
+            for index, kind in enumerate(tqdm(kinds, desc="episodes", disable=None)):
+                recorder.record(index, kind)
+    except BaseException:
+        shutil.rmtree(session, ignore_errors=True)
+        raise
+    (args.out / "kinds.json").write_text(json.dumps(kinds) + "\n", encoding="utf-8")
+    if args.only_session:
+        return
+    for how in ("xop", "stock"):
+        command = [sys.executable, __file__, "--die", how]
+        command += [f"--{key}={getattr(args, key)}" for key in ("out", "seed", "width", "height")]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != -signal.SIGKILL:
+            raise XopError(f"the session '{how}' was not killed but failed:\n{done.stderr[-2000:]}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
