@@ -54,6 +54,14 @@ class BadRecording(XopError, ValueError):
         super().__init__(f"operator recording '{path}': {fault}")
 
 
+class BadDataset(XopError, ValueError):
+    """A dataset is missing or malformed; the message names its directory and the fault."""
+
+    def __init__(self, root: object, fault: str) -> None:
+        self.root, self.fault = root, fault
+        super().__init__(f"dataset '{root}': {fault}")
+
+
 class NotConnected(XopError):
     """A device or robot is used before `connect()`."""
 

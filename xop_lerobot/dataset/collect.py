@@ -20,13 +20,14 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+from xop_lerobot.command_line import CommandParser
 from xop_lerobot.dataset.collect_config import CollectConfig
 from xop_lerobot.dataset.collect_folder import Attempt, CollectFolder
 from xop_lerobot.dataset.collect_pool import ENVIRONMENT, WorkerFailed, make_episodes
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
-from xop_lerobot.errors import BadValue, UnknownName, XopError
+from xop_lerobot.errors import BadValue, XopError
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C or SIGTERM."""
@@ -159,21 +160,9 @@ class _Progress:
         )
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are the project's own."""
-
-    def error(self, message: str) -> NoReturn:
-        raise BadValue(message)
-
-
-def make_parser() -> argparse.ArgumentParser:
+def make_parser() -> CommandParser:
     """Make the parser of the command line."""
-    parser = _Parser(
-        prog="xop-collect",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("xop-collect", __doc__)
     defaults = {each.name: each.default for each in fields(CollectConfig)}
 
     def add(name: str, text: str, **options: Any) -> None:
@@ -221,11 +210,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[CollectConfig, argparse.N
         BadValue: If a flag is absent or malformed.
         UnknownName: If one is unknown, listing the known ones.
     """
-    parser = make_parser()
-    args, unknown = parser.parse_known_args(arguments)
-    if unknown:
-        flags = [flag for action in parser._actions for flag in action.option_strings]
-        raise UnknownName("flag of xop-collect", unknown[0], [f for f in flags if f[:2] == "--"])
+    args = make_parser().parse(arguments)
     names = {each.name for each in fields(CollectConfig)} - {"video"}
     values = {name: getattr(args, name) for name in names}
     return CollectConfig(**values, video=not args.images), args

@@ -17,8 +17,9 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+from xop_lerobot.command_line import CommandParser
 from xop_lerobot.errors import BadValue, UnknownName, XopError
 
 logger = logging.getLogger(__name__)
@@ -28,21 +29,9 @@ INTERRUPTED = 130
 DEFAULT_TRIALS = 20
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are the project's own."""
-
-    def error(self, message: str) -> NoReturn:
-        raise BadValue(message)
-
-
-def make_parser() -> argparse.ArgumentParser:
+def make_parser() -> CommandParser:
     """Make the parser of the command line."""
-    parser = _Parser(
-        prog="xop-eval",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("xop-eval", __doc__)
     add = parser.add_argument
     add("--config", type=Path, help="YAML file of a whole study; --robot, --task, --methods, "
         "--variant and --low-level then choose from it (default: none)")  # fmt: skip
@@ -85,11 +74,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
         BadValue: If a flag is absent or malformed.
         UnknownName: If a flag is unknown, listing the known ones.
     """
-    parser = make_parser()
-    args, unknown = parser.parse_known_args(arguments)
-    if unknown:
-        flags = [flag for action in parser._actions for flag in action.option_strings]
-        raise UnknownName("flag of xop-eval", unknown[0], [f for f in flags if f[:2] == "--"])
+    args = make_parser().parse(arguments)
     if args.config is None:
         for name in ("robot", "task"):
             if getattr(args, name) is None:
