@@ -16,7 +16,7 @@ from xop_lerobot.errors import BadDataset
 
 EPISODES_DIR = Path("meta") / "episodes"
 _REQUIRED = ("episode_index", "length", "data/chunk_index", "data/file_index")
-_JSON_FACTS = ("versions", "settings", "changes")
+_JSON_FACTS = ("versions", "settings", "changes", "provenance")
 _BATCH = 64
 """Episodes whose metadata is in memory at a time."""
 

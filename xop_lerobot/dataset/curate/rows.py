@@ -52,8 +52,20 @@ class RowReader:
                 shape, or if it does not hold the whole episode.
         """
         names = tuple(dict.fromkeys(columns))
+        table = self.read_table(entry, names)
+        return {name: self._convert(entry, name, table[name]) for name in names}
+
+    def read_table(self, entry: EpisodeEntry, names: Sequence[str] = ()) -> pa.Table:
+        """Read columns of an episode as its file has them; all of its features without `names`.
+
+        Raises:
+            BadDataset: If the file is not readable, has not these columns, or does not hold the
+                whole episode.
+        """
+        if not names:
+            names = [key for key, each in self._features.items() if each["dtype"] != "video"]
         try:
-            table = self._read_table(entry, names)
+            table = self._read_table(entry, tuple(names))
         except (pa.ArrowException, OSError) as error:
             self.close()
             text = str(error).splitlines()[0]
@@ -64,7 +76,7 @@ class RowReader:
                 f"episode {entry.index} must have {entry.length} rows in {entry.file}, "
                 f"it has {table.num_rows}",
             )
-        return {name: self._convert(entry, name, table[name]) for name in names}
+        return table
 
     def _read_table(self, entry: EpisodeEntry, names: Sequence[str]) -> pa.Table:
         file = self._open(entry.file)

@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+import pyarrow as pa
 
 from xop_lerobot.dataset.curate.entries import EpisodeEntry, VideoSpan, read_entries
 from xop_lerobot.dataset.curate.rows import RowReader
@@ -106,6 +107,14 @@ class Source:
         wanted = tuple(columns)
         self.check(wanted)
         return self._rows.read(entry, wanted)
+
+    def read_table(self, entry: EpisodeEntry) -> pa.Table:
+        """Read all columns of an episode as they are in its file, pictures included.
+
+        Raises:
+            BadDataset: If the file is malformed, or does not hold the whole episode.
+        """
+        return self._rows.read_table(entry)
 
     def check(self, columns: Iterable[str]) -> None:
         """Check that the dataset has these columns.
