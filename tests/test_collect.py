@@ -24,8 +24,8 @@ import xop_lerobot.dataset.collect_folder as folder_module
 from xop_lerobot.dataset.collect import collect, main, make_parser, parse_arguments
 from xop_lerobot.dataset.collect_config import CollectConfig
 from xop_lerobot.dataset.collect_folder import CollectFolder, FolderTaken, OtherSettings
+from xop_lerobot.dataset.collect_jobs import WorkerFailed
 from xop_lerobot.dataset.collect_merge import merge_attempts
-from xop_lerobot.dataset.collect_pool import WorkerFailed
 from xop_lerobot.dataset.collect_worker import Collector
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.errors import BadValue, UnknownName, XopError
@@ -312,7 +312,9 @@ def test_sigterm_ends_in_one_line(orders, tmp_path, capsys):
 def test_a_worker_that_dies_is_replaced(serial, orders, tmp_path, capsys):
     (orders / "die-1").touch()
     collect(CONFIG, tmp_path / "data", 2, workers=1)
-    assert "episode 0: its worker ended by signal 9; once more" in capsys.readouterr().err
+    assert (
+        "episode 0: the worker process died (signal SIGKILL); once more" in capsys.readouterr().err
+    )
     assert len(read_facts(tmp_path / "data")) == 2
 
 
@@ -388,9 +390,10 @@ def test_cut_at_any_file_of_the_exchange(serial, tmp_path, monkeypatch):
     whole = tmp_path / "whole"
     folder = CollectFolder(whole)
     with folder.hold(config.to_settings()):
-        collector = Collector(config, folder, 0.0)
+        collector = Collector(config, 0.0)
         for index in range(2):
-            collector.collect(index)
+            draft = folder.open_attempt(index)
+            folder.close_attempt(draft, collector.make(index, draft))
         collector.close()
     assert folder.work.exists()
     for last in range(12):
@@ -402,7 +405,9 @@ def test_cut_at_any_file_of_the_exchange(serial, tmp_path, monkeypatch):
                 patch.setattr(module, name, fuse.wrap(getattr(module, name)))
             try:
                 with CollectFolder(root).hold(config.to_settings()):
-                    merge_attempts(CollectFolder(root), 2, "local/toy", config.to_settings(), dict)
+                    merge_attempts(
+                        CollectFolder(root), range(2), "local/toy", config.to_settings(), dict
+                    )
                 cut = False
             except Killed:
                 cut = True
@@ -435,7 +440,7 @@ def test_other_settings(serial, tmp_path):
     shutil.copytree(serial, root)
     config = dataclasses.replace(CONFIG, seed=4, cameras=("head", "scene"), noise="off")
     message = (
-        f"'{root}' was collected with other settings: seed 2 (asked for: 4), cameras head (asked "
+        f"'{root}' was made with other settings: seed 2 (asked for: 4), cameras head (asked "
         "for: head,scene), noise mild (asked for: off). Ask for the same, choose another --root, "
         "or delete it"
     )
@@ -448,7 +453,7 @@ def test_other_settings_of_an_unfinished_collection(tmp_path):
         folder.open_attempt(0)
         (folder.work / "attempts" / "000000").mkdir()
     message = (
-        f"'{folder.root}' was collected with other settings: seed 2 (asked for: 5). Ask for the "
+        f"'{folder.root}' was made with other settings: seed 2 (asked for: 5). Ask for the "
         "same, choose another --root, or delete it"
     )
     check_refused(dataclasses.replace(CONFIG, seed=5), folder.root, message, OtherSettings)

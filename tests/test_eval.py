@@ -17,7 +17,6 @@ from xop_lerobot.evaluation.methods import (
     parse_variant,
     resolve_low_level,
 )
-from xop_lerobot.evaluation.pool import THREAD_VARIABLES, run_jobs
 from xop_lerobot.evaluation.study import (
     Cell,
     Results,
@@ -31,6 +30,7 @@ from xop_lerobot.evaluation.study import (
 from xop_lerobot.evaluation.study_file import load_study
 from xop_lerobot.evaluation.trial import TrialSetup
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.pool import THREAD_VARIABLES, run_jobs
 
 CONTRACT = (
     "robot", "task", "method", "variant", "trials", "success", "pickup", "collision", "falls",

@@ -13,19 +13,17 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
-import time
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from xop_lerobot.command_line import CommandParser
 from xop_lerobot.dataset.collect_config import CollectConfig
-from xop_lerobot.dataset.collect_folder import Attempt, CollectFolder
-from xop_lerobot.dataset.collect_pool import ENVIRONMENT, WorkerFailed, make_episodes
+from xop_lerobot.dataset.collect_folder import CollectFolder
+from xop_lerobot.dataset.collect_jobs import WorkerFailed
+from xop_lerobot.dataset.collect_run import run_collection
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
 from xop_lerobot.errors import BadValue, XopError
 
@@ -55,7 +53,12 @@ class CollectResult:
 
 
 def collect(
-    config: CollectConfig, root: Path, episodes: int, repo_id: str = "", workers: int = 0
+    config: CollectConfig,
+    root: Path,
+    episodes: int,
+    repo_id: str = "",
+    workers: int = 0,
+    ray: str = "",
 ) -> CollectResult:
     """Collect a dataset, or what is missing of it.
 
@@ -64,100 +67,31 @@ def collect(
         root: Directory of the dataset.
         episodes: How many episodes there shall be.
         repo_id: Name of the dataset; empty for `local/` and the directory's name.
-        workers: Processes; 0 for one per core.
+        workers: Number of workers; 0 for one for each core.
+        ray: Address of a Ray cluster that makes them; empty for processes of this machine.
 
     Raises:
         XopError: If a setting is not valid, the directory is taken, or an episode fails.
     """
-    begin, start = time.time(), time.perf_counter()
     for name, value, low in (("episodes", episodes, 1), ("workers", workers, 0)):
         if value < low:
             raise BadValue(f"{name} must be at least {low}, got {value}")
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
     config.check()
-    settings = config.to_settings()
     folder = CollectFolder(root)
-    with folder.hold(settings):
-        done = folder.list_attempts()
-        missing = [index for index in range(episodes) if index not in done]
-        progress = _Progress(episodes, len(missing), config.fps)
-        if done:
-            progress.note_found(done)
-        crew = workers or len(os.sched_getaffinity(0))
-        # Closed at once, whatever happens: no worker may outlive the hold on the folder.
-        with closing(make_episodes(config, folder, missing, crew, begin)) as attempts:
-            for attempt in attempts:
-                done[attempt.index] = attempt
-                progress.note(attempt)
-        walls = _compute_walls(folder, done)
-
-        def note_walls() -> dict[str, float]:
-            return walls | {str(begin): time.perf_counter() - start}
-
-        merged = folder.read_dataset()
-        if any(index < episodes for index in folder.read_attempts()):
-            from xop_lerobot.dataset.collect_merge import merge_attempts  # noqa: PLC0415 torch
-
-            print("putting the episodes together", file=sys.stderr)
-            repo_id = repo_id or f"local/{root.name}"
-            merge_attempts(folder, episodes, repo_id, settings, note_walls)
-            merged, walls = folder.read_dataset(), note_walls()
-        if not merged:
-            print(f"no episode succeeded: '{root}' is not made", file=sys.stderr)
-        counted = [Attempt(**row) for row in merged.get("attempts", ())]
-        counted = counted or [done[index] for index in range(episodes)]
+    collection = run_collection(
+        config, folder, range(episodes), repo_id=repo_id, workers=workers, ray=ray
+    )
+    attempts = collection.attempts
+    if not folder.root.exists():
+        print(f"no episode succeeded: '{root}' is not made", file=sys.stderr)
     return CollectResult(
-        episodes=len(counted),
-        successes=sum(attempt.success for attempt in counted),
-        frames=sum(attempt.frames for attempt in counted if attempt.kept),
-        sim_s=round(sum(attempt.frames for attempt in counted) / config.fps, 3),
-        wall_s=round(sum(walls.values()), 3),
+        episodes=len(attempts),
+        successes=sum(attempt.success for attempt in attempts),
+        frames=sum(attempt.frames for attempt in attempts if attempt.kept),
+        sim_s=round(sum(attempt.frames for attempt in attempts) / config.fps, 3),
+        wall_s=round(collection.wall_s, 3),
         root=str(root),
     )
-
-
-def _compute_walls(folder: CollectFolder, attempts: dict[int, Attempt]) -> dict[str, float]:
-    """Compute how long each run took [s], by its start; a killed one until its last episode."""
-    walls: dict[str, float] = dict(folder.read_dataset().get("walls", {}))
-    for attempt in attempts.values():
-        run = str(attempt.run)
-        walls[run] = max(walls.get(run, 0.0), attempt.elapsed)
-    return walls
-
-
-class _Progress:
-    """Says on standard error how far it is.
-
-    Args:
-        episodes: How many episodes there shall be.
-        missing: How many of them are still to be made.
-        fps: Frames per second of simulated time [Hz].
-    """
-
-    def __init__(self, episodes: int, missing: int, fps: int) -> None:
-        self._episodes, self._missing, self._fps = episodes, missing, fps
-        self._start = time.perf_counter()
-        self._made = self._frames = self._successes = 0
-
-    def note_found(self, attempts: dict[int, Attempt]) -> None:
-        """Say what was there already."""
-        print(f"{len(attempts)} episodes are there already", file=sys.stderr)
-
-    def note(self, attempt: Attempt) -> None:
-        """Say what came of one episode."""
-        self._made += 1
-        self._frames += attempt.frames
-        self._successes += attempt.success
-        elapsed = time.perf_counter() - self._start
-        left = elapsed / self._made * (self._missing - self._made)
-        outcome = "success" if attempt.success else attempt.failure or "no success"
-        print(
-            f"episode {attempt.index}: {outcome}, {attempt.frames / self._fps:.1f} s. "
-            f"{self._made} of {self._missing} made, {self._successes} succeeded, "
-            f"{self._frames / self._fps / elapsed:.2f} x real time, {left / 60:.1f} min left",
-            file=sys.stderr,
-        )
 
 
 def make_parser() -> CommandParser:
@@ -181,7 +115,7 @@ def make_parser() -> CommandParser:
     add("root", "directory of the dataset", required=True, type=Path)
     add("repo-id", "name of the dataset; empty: local/<directory>", default="")
     add("seed", "seed of all that is random", type=int)
-    add("workers", "processes; 0: one per core", type=int, default=0)
+    add_crew(parser)
     add("cameras", "cameras, with commas between", type=_split)
     add("low-level", "low-level policy; default: the robot's own")
     add("low-level-path", "file of the low-level policy; empty: its default")
@@ -197,6 +131,20 @@ def make_parser() -> CommandParser:
     add("only-successful", "leave episodes without success out", action="store_true")
     add("images", "store pictures as PNG and not as h264 video", action="store_true")
     return parser
+
+
+def add_crew(parser: CommandParser) -> None:
+    """Add `--workers` and `--ray`, which say who makes the episodes."""
+    parser.add_argument(
+        "--workers", type=int, default=0, help="processes; 0: one per core (default: 0)"
+    )
+    parser.add_argument(
+        "--ray",
+        default="",
+        metavar="ADDRESS",
+        help="make the episodes on a Ray cluster: local, auto, HOST:PORT or ray://HOST:PORT "
+        "(default: none)",
+    )
 
 
 def _split(text: str) -> tuple[str, ...]:
@@ -222,7 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         config, args = parse_arguments(sys.argv[1:] if arguments is None else arguments)
         with stop_on_sigterm():
-            result = collect(config, args.root, args.episodes, args.repo_id, args.workers)
+            result = collect(config, args.root, args.episodes, args.repo_id, args.workers, args.ray)
     except KeyboardInterrupt:
         print("stopped; the same command goes on with the finished episodes", file=sys.stderr)
         return INTERRUPTED

@@ -14,6 +14,7 @@ from xop_lerobot.errors import BadValue
 if TYPE_CHECKING:
     from lerobot_robot_xop import XopRobotConfig
     from lerobot_teleoperator_xop import XopConfig
+    from xop_lerobot.dataset.collect_worker import Collector
     from xop_lerobot.morphology.morphology import Morphology
     from xop_lerobot.tasks.task import Task
 
@@ -79,6 +80,16 @@ class CollectConfig:
         settings = dataclasses.asdict(self)
         del settings["plugins"]
         return {**settings, "cameras": list(self.cameras)}
+
+    def make_maker(self, run: float) -> Collector:
+        """Make what makes the episodes, in a worker of its own.
+
+        Args:
+            run: When the run began [s since the epoch].
+        """
+        from xop_lerobot.dataset.collect_worker import Collector  # noqa: PLC0415 torch
+
+        return Collector(self, run)
 
     @property
     def morphology(self) -> Morphology:

@@ -23,13 +23,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from xop_lerobot.dataset.facts import FACTS_DIR
 from xop_lerobot.errors import XopError
 
 COLLECT_FILE = FACTS_DIR / "collect.json"
 """What a collected dataset says of its collection."""
+DATASET = "dataset"
+"""Directory of an episode's own dataset in its folder."""
 
 
 class FolderTaken(XopError, FileExistsError):
@@ -43,16 +45,19 @@ class OtherSettings(XopError):
         root: Directory of the dataset.
         held: Settings of the collection that is there.
         asked: Settings that were asked for.
+        flag: Flag that names the directory.
     """
 
-    def __init__(self, root: Path, held: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+    def __init__(
+        self, root: Path, held: Mapping[str, Any], asked: Mapping[str, Any], flag: str
+    ) -> None:
         names = [name for name in asked if held.get(name) != asked[name]]
         pairs = ", ".join(
             f"{name} {_show(held.get(name))} (asked for: {_show(asked[name])})" for name in names
         )
         super().__init__(
-            f"'{root}' was collected with other settings: {pairs}. Ask for the same, choose "
-            "another --root, or delete it"
+            f"'{root}' was made with other settings: {pairs}. Ask for the same, choose "
+            f"another {flag}, or delete it"
         )
 
 
@@ -94,7 +99,14 @@ class CollectFolder:
     Attributes:
         root: The same.
         work: Directory of all that is not finished.
+        command: Command whose files these are, as it reads in an error.
+        flag: Its flag that names the directory.
+        record: File in which the dataset says how it was made.
     """
+
+    command: ClassVar[str] = "xop-collect"
+    flag: ClassVar[str] = "--root"
+    record: ClassVar[Path] = COLLECT_FILE
 
     def __init__(self, root: Path) -> None:
         self.root = root.resolve()
@@ -117,8 +129,8 @@ class CollectFolder:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise FolderTaken(
-                    f"another xop-collect is at work on '{self.root}'. Wait for it, or choose "
-                    "another --root"
+                    f"another {self.command} is at work on '{self.root}'. Wait for it, or choose "
+                    f"another {self.flag}"
                 ) from None
             try:
                 self._finish_exchange()
@@ -135,18 +147,18 @@ class CollectFolder:
         if root.is_mount():
             raise FolderTaken(
                 f"'{root}' is a mount point, which a dataset can't take the place of. Choose a "
-                "directory inside it as --root"
+                f"directory inside it as {self.flag}"
             )
-        if not root.exists() or (root / COLLECT_FILE).exists():
+        if not root.exists() or (root / self.record).exists():
             return
         if (root / "meta" / "info.json").exists():
             raise FolderTaken(
-                f"'{root}' holds a dataset that xop-collect did not make. Choose another --root, "
-                "or delete it"
+                f"'{root}' holds a dataset that {self.command} did not make. Choose another "
+                f"{self.flag}, or delete it"
             )
         if not root.is_dir() or any(root.iterdir()):
             raise FolderTaken(
-                f"'{root}' exists and is no dataset. Choose another --root, or delete it"
+                f"'{root}' exists and is no dataset. Choose another {self.flag}, or delete it"
             )
 
     def _finish_exchange(self) -> None:
@@ -171,7 +183,7 @@ class CollectFolder:
         if held is None and self._settings.exists():
             held = json.loads(self._settings.read_text(encoding="utf-8"))
         if held is not None and held != settings:
-            raise OtherSettings(self.root, held, settings)
+            raise OtherSettings(self.root, held, settings, self.flag)
         self._attempts.mkdir(exist_ok=True)
         write_whole(self._settings, settings)
 
@@ -186,7 +198,7 @@ class CollectFolder:
 
     def read_dataset(self) -> dict[str, Any]:
         """Read what the finished dataset says of its collection; empty while there is none."""
-        path = self.root / COLLECT_FILE
+        path = self.root / self.record
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
     def list_attempts(self) -> dict[int, Attempt]:
@@ -204,7 +216,7 @@ class CollectFolder:
 
     def get_dataset(self, index: int) -> Path:
         """Return the dataset that holds the finished episode `index` alone."""
-        return self._find(index) / "dataset"
+        return self._find(index) / DATASET
 
     def open_attempt(self, index: int) -> Path:
         """Make the directory of episode `index`, to work in."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,13 @@ from lerobot.datasets import dataset_metadata
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.utils import EPISODES_DIR
 
-from xop_lerobot.dataset.collect_folder import COLLECT_FILE, CollectFolder, write_whole
+from xop_lerobot.dataset.collect_folder import CollectFolder, write_whole
 from xop_lerobot.dataset.facts import CONFIG_FILE, EPISODES_FILE, FACTS_DIR, read_facts
 
 
 def merge_attempts(
     folder: CollectFolder,
-    count: int,
+    indices: Container[int],
     repo_id: str,
     settings: Mapping[str, Any],
     note_walls: Callable[[], Mapping[str, float]],
@@ -35,12 +35,12 @@ def merge_attempts(
 
     Args:
         folder: The collection's files.
-        count: Episodes with an index below this are merged, the others stay for another time.
+        indices: Episodes that are merged; others stay for another time.
         repo_id: Name of the dataset.
         settings: What was collected.
         note_walls: Tells how long each run took so far [s], by its start.
     """
-    attempts = [each for index, each in folder.read_attempts().items() if index < count]
+    attempts = [each for index, each in folder.read_attempts().items() if index in indices]
     before = folder.read_dataset()
     sources = [folder.root] if before else []
     sources += [folder.get_dataset(attempt.index) for attempt in attempts if attempt.kept]
@@ -60,7 +60,7 @@ def merge_attempts(
     _merge_facts(sources, merged)
     rows = [*before.get("attempts", ()), *map(dataclasses.asdict, attempts)]
     document = {"settings": settings, "walls": note_walls(), "attempts": rows}
-    write_whole(merged / COLLECT_FILE, document)
+    write_whole(merged / folder.record, document)
     folder.exchange(attempt.index for attempt in attempts)
 
 

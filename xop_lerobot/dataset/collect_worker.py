@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import av
 import av.logging
@@ -18,7 +19,8 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.utils.import_utils import make_device_from_device_class
 
 from xop_lerobot.dataset.collect_config import CollectConfig, import_plugins
-from xop_lerobot.dataset.collect_folder import Attempt, CollectFolder
+from xop_lerobot.dataset.collect_folder import DATASET, Attempt
+from xop_lerobot.dataset.collect_jobs import get_index
 from xop_lerobot.dataset.host import count_ticks
 from xop_lerobot.dataset.record import build_features
 from xop_lerobot.dataset.tick import run_tick
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
     from lerobot_robot_xop.xop_robot import XopRobot
     from lerobot_teleoperator_xop.xop import Xop
+    from xop_lerobot.tasks.task import Task
 
 _GRACE_S = 10.0
 """How long after a task's own time limit an episode is ended all the same [s]."""
@@ -42,34 +45,36 @@ class Collector:
 
     Args:
         config: What is collected.
-        folder: Where to.
         run: When this run began [s since the epoch].
     """
 
-    def __init__(self, config: CollectConfig, folder: CollectFolder, run: float) -> None:
+    def __init__(self, config: CollectConfig, run: float) -> None:
         import_plugins(config.plugins)
         _calm_down()
-        self.config, self.folder, self.run = config, folder, run
-        task = config.make_task()
-        self._instruction = task.instruction
-        self._limit = count_ticks(task.time_limit + _GRACE_S, config.fps)
+        self.config, self.run = config, run
         self.robot: XopRobot = make_device_from_device_class(config.make_robot_config())
-        self._session = get_session(self.robot.config.session)
+        self.session = get_session(self.robot.config.session)
         self.robot.connect()
 
-    def collect(self, index: int) -> Attempt:
-        """Make episode `index`, and let it count."""
+    def make(self, job: Any, folder: Path) -> Attempt:
+        """Make an episode.
+
+        Args:
+            job: Index of the episode.
+            folder: Directory of its own; the episode is the dataset `DATASET` in it.
+        """
         cpu = time.process_time()
-        folder = self.folder.open_attempt(index)
+        index = get_index(job)
         teleop: Xop = make_device_from_device_class(self.config.make_teleop_config())
         # LeRobot's own loop is not used here, so it needs no help.
         teleop.host.remove()
+        self.prepare(job, teleop)
         teleop.connect()
         try:
-            dataset = self._create(folder / "dataset")
+            dataset = self._create(folder / DATASET)
             try:
-                frames = self._run(index, teleop, dataset)
-                outcome = self._session.outcome
+                frames = self._run(job, teleop, dataset)
+                outcome = self.session.outcome
                 success = outcome is not None and outcome.success
                 kept = success or not self.config.only_successful
                 if kept:
@@ -80,23 +85,20 @@ class Collector:
                 dataset.finalize()
         finally:
             teleop.disconnect()
-        failure = "" if success else str(getattr(outcome, "failure", ""))
-        attempt = Attempt(
+        return Attempt(
             index,
             success,
-            failure,
-            kept,
-            frames,
+            failure="" if success else str(getattr(outcome, "failure", "")),
+            kept=kept,
+            frames=frames,
             run=self.run,
             elapsed=time.time() - self.run,
             cpu_s=time.process_time() - cpu,
         )
-        self.folder.close_attempt(folder, attempt)
-        return attempt
 
     def _create(self, root: Path) -> XopDataset:
         config = self.config
-        return XopDataset.bind(self._session.name).create(
+        return XopDataset.bind(self.session.name).create(
             "local/episode",
             config.fps,
             build_features(self.robot, use_videos=config.video),
@@ -111,19 +113,38 @@ class Collector:
             image_writer_threads=0 if config.video else len(config.cameras),
         )
 
-    def _run(self, index: int, teleop: Xop, dataset: XopDataset) -> int:
+    def _run(self, job: Any, teleop: Xop, dataset: XopDataset) -> int:
         """Run the episode until its task, its operator or its time is over; return its frames."""
-        self._session.begin_episode(index)
+        self.session.begin_episode(get_index(job))
         events = {"exit_early": False}
-        dataset.begin(events, self._limit)
+        dataset.begin(events, self.get_limit(job))
         frames = 0
         while not events["exit_early"]:
-            run_tick(self.robot, teleop, dataset, self._instruction)
+            run_tick(self.robot, teleop, dataset, self.get_instruction(job, frames))
             frames += 1
-            outcome = self._session.outcome
+            outcome = self.session.outcome
             if outcome is not None and outcome.done:
                 break
         return frames
+
+    # What depends on the kind of collection.
+
+    def prepare(self, job: Any, teleop: Xop) -> None:
+        """Do what must be done before the teleoperator of an episode is connected."""
+
+    def get_limit(self, job: Any) -> int:
+        """Frames after which an episode is ended in any case."""
+        del job
+        return count_ticks(self._task.time_limit + _GRACE_S, self.config.fps)
+
+    def get_instruction(self, job: Any, frame: int) -> str:
+        """The task in words, at a frame of an episode."""
+        del job, frame
+        return self._task.instruction
+
+    @cached_property
+    def _task(self) -> Task:
+        return self.config.make_task()
 
     def close(self) -> None:
         """Let go of the robot; may be called twice."""
