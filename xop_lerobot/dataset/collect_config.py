@@ -14,6 +14,7 @@ from xop_lerobot.errors import BadValue
 if TYPE_CHECKING:
     from lerobot_robot_xop import XopRobotConfig
     from lerobot_teleoperator_xop import XopConfig
+    from xop_lerobot.dataset.collect_folder import Attempt
     from xop_lerobot.dataset.collect_worker import Collector
     from xop_lerobot.morphology.morphology import Morphology
     from xop_lerobot.tasks.task import Task
@@ -80,6 +81,10 @@ class CollectConfig:
         settings = dataclasses.asdict(self)
         del settings["plugins"]
         return {**settings, "cameras": list(self.cameras)}
+
+    def describe(self, attempt: Attempt) -> str:
+        """Say in a few words what came of an episode."""
+        return "success" if attempt.success else attempt.failure or "no success"
 
     def make_maker(self, run: float) -> Collector:
         """Make what makes the episodes, in a worker of its own.

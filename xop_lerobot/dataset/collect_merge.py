@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from lerobot.datasets import dataset_metadata
+from lerobot.datasets import aggregate, dataset_metadata
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.utils import EPISODES_DIR
 
@@ -48,7 +49,10 @@ def merge_attempts(
         return
     merged = folder.merged
     shutil.rmtree(merged, ignore_errors=True)
-    with _read_episodes_fast():
+    with (
+        _replaced(dataset_metadata, "load_episodes", _load_episodes),
+        _replaced(aggregate, "tqdm", SimpleNamespace(tqdm=_show_nothing)),
+    ):
         aggregate_datasets(
             [repo_id] * len(sources),
             repo_id,
@@ -75,25 +79,31 @@ def _merge_facts(sources: Sequence[Path], merged: Path) -> None:
 
 
 @contextmanager
-def _read_episodes_fast() -> Iterator[None]:
-    """In the block, let LeRobot read the episodes' metadata without `datasets`.
-
-    That library takes a second for the 900 columns of a single episode. Without its name in
-    LeRobot's module, nothing is replaced.
-    """
-    stock = getattr(dataset_metadata, "load_episodes", None)
-    if stock is None:
+def _replaced(module: ModuleType, name: str, ours: Any) -> Iterator[None]:
+    """In the block, give LeRobot's module another `name`; nothing where it has none."""
+    if not hasattr(module, name):
         yield
         return
-    dataset_metadata.load_episodes = _load_episodes  # pyright: ignore
+    stock = getattr(module, name)
+    setattr(module, name, ours)
     try:
         yield
     finally:
-        dataset_metadata.load_episodes = stock  # pyright: ignore
+        setattr(module, name, stock)
+
+
+def _show_nothing(things: Iterable[Any], **options: Any) -> Iterable[Any]:
+    """Stand for LeRobot's progress bars, which would be among the command's own lines."""
+    del options
+    return things
 
 
 def _load_episodes(root: Path) -> dict[str, list]:
-    """Read the columns of a dataset's episode metadata, but for the statistics."""
+    """Read the columns of a dataset's episode metadata, but for the statistics.
+
+    LeRobot's own goes through `datasets`, which takes a second for the 900 columns of a single
+    episode.
+    """
     tables = []
     for path in sorted((root / EPISODES_DIR).glob("*/*.parquet")):
         names = [name for name in pq.read_schema(path).names if not name.startswith("stats/")]

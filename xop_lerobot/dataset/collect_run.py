@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
+
+from tqdm import tqdm
 
 from xop_lerobot.dataset.collect_folder import Attempt, CollectFolder
 from xop_lerobot.dataset.collect_jobs import make_attempts
@@ -38,6 +39,7 @@ def run_collection(
     repo_id: str = "",
     workers: int = 0,
     ray: str = "",
+    quiet: bool = False,
     make_jobs: Callable[[Sequence[int]], Iterable[Any]] = iter,
 ) -> Collection:
     """Make the episodes that are not there yet, and merge all into one dataset.
@@ -49,6 +51,7 @@ def run_collection(
         repo_id: Name of the dataset; empty for `local/` and the directory's name.
         workers: Number of workers; 0 for one for each core.
         ray: Address of a Ray cluster; empty for processes of this machine.
+        quiet: Whether to show no progress.
         make_jobs: Makes jobs for those of the indices that are missing, as `config`'s maker
             takes them.
 
@@ -56,31 +59,30 @@ def run_collection(
         XopError: If the directory is taken, or an episode fails.
     """
     begin, start = time.time(), time.perf_counter()
-    # Read when they are loaded: the merge would draw bars of its own.
-    os.environ.setdefault("TQDM_DISABLE", "1")
     settings = config.to_settings()
     with folder.hold(settings):
         done = folder.list_attempts()
         missing = [index for index in indices if index not in done]
-        progress = _Progress(len(missing), config.fps)
-        if done:
-            print(f"{len(done)} episodes are there already", file=sys.stderr)
         # Closed at once, whatever happens: no worker may outlive the hold on the folder.
-        jobs = make_jobs(missing)
-        with closing(make_attempts(config, folder, jobs, workers, begin, ray)) as attempts:
-            for attempt in attempts:
+        made = make_attempts(config, folder, make_jobs(missing), workers, begin, ray)
+        with _Progress(config, len(missing), quiet=quiet) as progress, closing(made):
+            if done:
+                progress.say(f"{len(done)} episodes are there already")
+            for attempt in made:
                 done[attempt.index] = attempt
                 progress.note(attempt)
+            are_new = bool(folder.read_attempts().keys() & set(indices))
+            if are_new:
+                progress.say("putting the episodes together")
         walls = _compute_walls(folder, done)
 
         def note_walls() -> dict[str, float]:
             return walls | {str(begin): time.perf_counter() - start}
 
         merged = folder.read_dataset()
-        if folder.read_attempts().keys() & set(indices):
+        if are_new:
             from xop_lerobot.dataset.collect_merge import merge_attempts  # noqa: PLC0415 torch
 
-            print("putting the episodes together", file=sys.stderr)
             repo_id = repo_id or f"local/{folder.root.name}"
             merge_attempts(folder, indices, repo_id, settings, note_walls)
             merged, walls = folder.read_dataset(), note_walls()
@@ -99,17 +101,35 @@ def _compute_walls(folder: CollectFolder, attempts: dict[int, Attempt]) -> dict[
 
 
 class _Progress:
-    """Says on standard error how far it is.
+    """Says on standard error how far it is: a line an episode, and a bar where it is a terminal.
 
     Args:
+        config: What is collected.
         missing: How many episodes are still to be made.
-        fps: Frames per second of simulated time [Hz].
+        quiet: Whether to say nothing.
     """
 
-    def __init__(self, missing: int, fps: int) -> None:
-        self._missing, self._fps = missing, fps
+    def __init__(self, config: CollectConfig, missing: int, *, quiet: bool) -> None:
+        self._config, self._missing, self._quiet = config, missing, quiet
         self._start = time.perf_counter()
         self._made = self._frames = self._successes = 0
+        # None: no bar where standard error is no terminal.
+        self._bar = tqdm(total=missing, unit="episode", disable=quiet or None, leave=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def say(self, text: str) -> None:
+        """Say something, above the bar."""
+        if self._quiet:
+            return
+        if self._bar.disable:
+            print(text, file=sys.stderr, flush=True)
+        else:
+            self._bar.write(text, file=sys.stderr)
 
     def note(self, attempt: Attempt) -> None:
         """Say what came of one episode."""
@@ -118,10 +138,11 @@ class _Progress:
         self._successes += attempt.success
         elapsed = time.perf_counter() - self._start
         left = elapsed / self._made * (self._missing - self._made)
-        outcome = "success" if attempt.success else attempt.failure or "no success"
-        print(
-            f"episode {attempt.index}: {outcome}, {attempt.frames / self._fps:.1f} s. "
-            f"{self._made} of {self._missing} made, {self._successes} succeeded, "
-            f"{self._frames / self._fps / elapsed:.2f} x real time, {left / 60:.1f} min left",
-            file=sys.stderr,
+        seconds = 1 / self._config.fps
+        succeeded = f"{self._successes} succeeded, " if self._config.task else ""
+        self._bar.update()
+        self.say(
+            f"episode {attempt.index}: {self._config.describe(attempt)}, "
+            f"{attempt.frames * seconds:.1f} s. {self._made} of {self._missing} made, {succeeded}"
+            f"{self._frames * seconds / elapsed:.2f} x real time, {left / 60:.1f} min left"
         )
