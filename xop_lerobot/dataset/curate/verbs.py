@@ -20,7 +20,11 @@ from xop_lerobot.command_line import CommandParser
 from xop_lerobot.errors import UnknownName
 
 _PACKAGE = "xop_lerobot.dataset.curate"
-VERBS = {}
+VERBS = {
+    "trim": "trim",
+    "merge": "merge",
+    "split": "split",
+}
 """Module of each verb, in the order of the list."""
 
 

@@ -1,0 +1,111 @@
+"""The data files of a new dataset: rows as LeRobot writes them, a row group for each episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+from lerobot.datasets.utils import update_chunk_file_indices
+
+from xop_lerobot.errors import BadDataset
+
+
+class RowFiles:
+    """Writes episodes' rows.
+
+    Episodes that come from one file, one after another, go to one file again.
+
+    Args:
+        root: Directory of the new dataset.
+        template: `data_path` of its `meta/info.json`.
+        chunks_size: How many files go into a directory.
+        features: Its features.
+    """
+
+    def __init__(
+        self, root: Path, template: str, chunks_size: int, features: Mapping[str, Any]
+    ) -> None:
+        self._root, self._template, self._chunks_size = root, template, chunks_size
+        self._schema = get_hf_features_from_features(dict(features)).arrow_schema
+        self._writer: pq.ParquetWriter | None = None
+        self._origin: object = None
+        self.place = (0, -1)
+
+    def write(
+        self, table: pa.Table, columns: Mapping[str, np.ndarray], origin: object
+    ) -> tuple[int, int]:
+        """Write the rows of an episode.
+
+        Args:
+            table: Its rows as they were.
+            columns: Columns that are new or different. Shapes (n, size) or (n,).
+            origin: Which file they come from.
+
+        Returns:
+            Chunk and file that they are in.
+
+        Raises:
+            BadDataset: If a column is missing, or is not what the features say.
+        """
+        arrays = []
+        for field in self._schema:
+            try:
+                if field.name in columns:
+                    arrays.append(to_arrow(columns[field.name], field.type))
+                else:
+                    arrays.append(cast_column(table[field.name], field.type))
+            except (pa.ArrowException, KeyError) as error:
+                raise BadDataset(
+                    origin, f"its column '{field.name}' is not {field.type} ({error})"
+                ) from error
+        if self._writer is None or origin != self._origin:
+            self._open(origin)
+        assert self._writer is not None
+        self._writer.write_table(pa.Table.from_arrays(arrays, schema=self._schema))
+        return self.place
+
+    def _open(self, origin: object) -> None:
+        self.close()
+        self.place = next_place(self.place, self._chunks_size)
+        chunk, file = self.place
+        path = self._root / self._template.format(chunk_index=chunk, file_index=file)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._writer = pq.ParquetWriter(
+            path, schema=self._schema, compression="snappy", use_dictionary=True
+        )
+        self._origin = origin
+
+    def close(self) -> None:
+        """Finish the file; may be called twice."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+def next_place(place: tuple[int, int], chunks_size: int) -> tuple[int, int]:
+    """Return the chunk and file after `place`; the first after (0, -1)."""
+    chunk, file = place
+    return (chunk, 0) if file < 0 else update_chunk_file_indices(chunk, file, chunks_size)
+
+
+def to_arrow(values: np.ndarray, kind: pa.DataType) -> pa.Array:
+    """Turn an array into a column of the type `kind`, a list a row if that is one."""
+    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+    if pa.types.is_fixed_size_list(kind):
+        return pa.FixedSizeListArray.from_arrays(flat.cast(kind.value_type), type=kind)
+    return flat.cast(kind)
+
+
+def cast_column(column: pa.ChunkedArray, kind: pa.DataType) -> pa.Array:
+    """Bring a column to the type `kind`, which other tools may have written in another way."""
+    values = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
+    if isinstance(values, pa.ExtensionArray):
+        values = values.storage
+    if isinstance(kind, pa.ExtensionType):
+        return pa.ExtensionArray.from_storage(kind, values.cast(kind.storage_type))
+    return values if values.type == kind else values.cast(kind)

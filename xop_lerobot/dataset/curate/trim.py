@@ -1,0 +1,207 @@
+"""Cut idle starts and ends off every episode, and leave a margin.
+
+Idle is a frame in which nobody drives, or around which neither the person nor the robot moves
+(`xop_lerobot.dataset.quality.find_idle`). Datasets of other projects have no operator; there it is
+the action that does not move. Rows, pictures, time stamps, statistics and facts are cut to fit; no
+picture is encoded anew. The end is never cut before the last change of `next.success`.
+
+    xop-curate trim --root outputs/boxes --out outputs/boxes_trimmed --margin 0.5
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.command_line import CommandParser
+from xop_lerobot.dataset.curate.arguments import (
+    add_destination,
+    add_source,
+    make_destination,
+    show_progress,
+)
+from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
+from xop_lerobot.dataset.quality import (
+    STILL_LIMIT_M,
+    find_active_span,
+    find_idle,
+    find_still,
+)
+from xop_lerobot.errors import BadDataset, BadValue
+from xop_lerobot.state import FRAMES
+
+if TYPE_CHECKING:
+    from xop_lerobot.dataset.curate.clip import Clip
+
+SUMMARY = "cut idle starts and ends"
+
+_ENDS = ("start", "end", "both")
+_ENGAGED, _ACTION = "operator.engaged", "action"
+_OUTCOME = ("next.success", "next.done")
+_SHARE = 0.02
+"""Share of its range in the episode by which an action that stands still varies."""
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the verb's flags."""
+    add_source(parser)
+    add_destination(parser)
+    parser.add_argument(
+        "--margin",
+        type=float,
+        default=0.5,
+        metavar="S",
+        help="idle time that stays at each end [s] (default: 0.5)",
+    )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=STILL_LIMIT_M,
+        metavar="M",
+        help="how far what stands still moves within half a second [m] "
+        f"(default: {STILL_LIMIT_M:g})",
+    )
+    parser.add_argument(
+        "--ends", choices=_ENDS, default="both", help="what is cut: start, end or both (default)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Trim a dataset; returns the exit code."""
+    for name in ("margin", "limit"):
+        value = getattr(arguments, name)
+        if not (math.isfinite(value) and value >= 0):
+            raise BadValue(f"--{name} must be finite and at least 0, got {value}")
+    with Source(arguments.root) as source:
+        destination = make_destination(arguments, source.root)
+        trimmer = Trimmer(source, arguments.margin, arguments.limit, arguments.ends)
+        clips = trimmer.make_clips(quiet=arguments.quiet)
+        if destination is None:
+            for _ in clips:
+                pass
+        else:
+            from xop_lerobot.dataset.curate.transfer import Step, transfer  # noqa: PLC0415 torch
+
+            step = Step.now(
+                "trim", margin=arguments.margin, limit=arguments.limit, ends=arguments.ends
+            )
+            with destination as draft:
+                transfer(clips, draft, step)
+    trimmer.report()
+    if destination is not None:
+        print(f"written to {destination.root}")
+    return 0
+
+
+class Trimmer:
+    """Finds what is cut off each episode.
+
+    Args:
+        source: The dataset.
+        margin: Idle time that stays [s].
+        limit: How far what stands still moves [m].
+        ends: `start`, `end` or `both`.
+
+    Raises:
+        BadDataset: If it has no column that tells whether anything moves.
+    """
+
+    def __init__(
+        self, source: Source, margin: float, limit: float = STILL_LIMIT_M, ends: str = "both"
+    ) -> None:
+        self._source, self._margin, self._limit, self._ends = source, margin, limit, ends
+        names = (f"operator.{frame}" for frame in FRAMES)
+        robot = (key for key in source.features if key.startswith("robot."))
+        self._poses = [
+            key
+            for key in (*names, *robot)
+            if source.features.get(key, {}).get("shape") == [7] and key in source.features
+        ]
+        if _ENGAGED not in source.features or not self._poses:
+            self._poses = []
+            if _ACTION not in source.features:
+                raise BadDataset(
+                    source.root,
+                    "it has neither poses of an operator nor an action, so nothing tells what is "
+                    f"idle. Its columns: {', '.join(sorted(source.features))}",
+                )
+        self._lines: list[str] = []
+        self._frames = self._kept = 0
+
+    def make_clips(self, *, quiet: bool = True) -> Iterator[Clip]:
+        """Make what stays of each episode."""
+        from xop_lerobot.dataset.curate.clip import Clip  # noqa: PLC0415
+
+        source = self._source
+        for entry in show_progress(source.episodes, source.total_episodes, "episode", quiet=quiet):
+            span = self.find_span(entry)
+            self._note(entry, span)
+            if span == (0, entry.length):
+                yield Clip(source, entry)
+            else:
+                yield Clip(source, entry, span, columns=self._end_outcome(entry, span))
+
+    def find_span(self, entry: EpisodeEntry) -> tuple[int, int]:
+        """Find the first frame that stays, and the one after the last; all if nothing moves."""
+        idle = self._find_idle(entry)
+        start, stop = find_active_span(idle)
+        if start == stop:
+            return 0, entry.length
+        margin = round(self._margin * self._source.fps)
+        start = max(0, start - margin) if self._ends != "end" else 0
+        stop = min(entry.length, stop + margin) if self._ends != "start" else entry.length
+        if _OUTCOME[0] in self._source.features:
+            success = self._source.read(entry, _OUTCOME[:1])[_OUTCOME[0]][:, 0]
+            changes = np.flatnonzero(np.diff(success.astype(int)))
+            if changes.size:
+                stop = max(stop, int(changes[-1]) + 2)
+        return start, stop
+
+    def _find_idle(self, entry: EpisodeEntry) -> np.ndarray:
+        source, dt = self._source, 1 / self._source.fps
+        if not self._poses:
+            action = source.read(entry, [_ACTION])[_ACTION].astype(float)
+            spread = np.ptp(action, axis=0)
+            moving = action[:, spread > 0] / spread[spread > 0]
+            return find_still(moving, dt, _SHARE)
+        columns = source.read(entry, [*self._poses, _ENGAGED])
+        engaged = columns[_ENGAGED][:, 0].astype(bool)
+        if not engaged.any():  # a policy drove
+            engaged[:] = True
+        # What was not seen yet, or never, is 0, and no pose.
+        poses = [columns[key] for key in self._poses if columns[key][:, 3:].any(axis=1).all()]
+        return find_idle(poses, engaged, dt, self._limit)
+
+    def _end_outcome(self, entry: EpisodeEntry, span: tuple[int, int]) -> dict[str, np.ndarray]:
+        """Let the last row say what the last row of the whole episode said."""
+        keys = [key for key in _OUTCOME if key in self._source.features]
+        columns = {}
+        for key, values in self._source.read(entry, keys).items() if keys else ():
+            columns[key] = values[slice(*span)].copy()
+            columns[key][-1] = values[-1]
+        return columns
+
+    def _note(self, entry: EpisodeEntry, span: tuple[int, int]) -> None:
+        start, stop = span
+        self._frames += entry.length
+        self._kept += stop - start
+        if stop - start < entry.length:
+            fps = self._source.fps
+            self._lines.append(
+                f"episode {entry.index}: {entry.length / fps:.2f} s, {start / fps:.2f} s cut off "
+                f"the start, {(entry.length - stop) / fps:.2f} s off the end"
+            )
+
+    def report(self) -> None:
+        """Print what was cut."""
+        for line in self._lines:
+            print(line)
+        fps = self._source.fps
+        print(
+            f"{len(self._lines)} episodes cut, {(self._frames - self._kept) / fps:.2f} s of "
+            f"{self._frames / fps:.2f} s"
+        )
