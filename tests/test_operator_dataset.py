@@ -10,7 +10,7 @@ import pytest
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadRecording
-from xop_lerobot.operator.dataset_recording import load_dataset_recording
+from xop_lerobot.operator.dataset_recording import load_dataset_recording, make_dataset_recording
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 
 FPS = 25
@@ -86,6 +86,65 @@ def test_time_falls_back_on_the_timestamp(tmp_path: Path) -> None:
     assert recording.duration == pytest.approx((LENGTH - 1 - ENGAGED_AT) / FPS)
 
 
+def make_columns(**changed: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of an episode in which all is as it should be."""
+    pose = np.tile([0, 0, 1.6, 1, 0, 0, 0], (LENGTH, 1))
+    pose[:, 0] = np.arange(LENGTH) / FPS
+    return {
+        "operator.head": pose,
+        "operator.left_wrist": pose,
+        "operator.right_wrist": pose,
+        "operator.pinch": np.full((LENGTH, 2), 0.05),
+        "operator.tracked": np.ones((LENGTH, 3), bool),
+        "operator.engaged": np.ones((LENGTH, 1), bool),
+        "time.sim": np.arange(LENGTH)[:, None] / FPS,
+        "time.wall": 1_700_000_000_000_000_000 + np.arange(LENGTH)[:, None] * 50_000_000,
+        **changed,
+    }
+
+
+def test_person_who_lets_go_of_the_robot_does_so_again() -> None:
+    engaged = np.ones((LENGTH, 1), bool)
+    engaged[:2] = engaged[8:12] = engaged[18:] = False
+    recording, rows = make_dataset_recording(make_columns(**{"operator.engaged": engaged}), {}, "x")
+    assert rows.tolist() == list(range(2, 18))
+    assert [recording.is_engaged_at(i / FPS) for i in range(16)] == engaged[2:18, 0].tolist()
+    # A clock that adds up rounding takes the very sample that it means.
+    assert not recording.is_engaged_at(6 / FPS - 1e-12)
+
+
+def test_rows_in_which_the_clock_stands_still_are_left_out() -> None:
+    t = np.arange(LENGTH) / FPS
+    t[7], t[11] = t[6], t[9]
+    recording, rows = make_dataset_recording(make_columns(**{"time.sim": t[:, None]}), {}, "x")
+    assert rows.tolist() == [i for i in range(LENGTH) if i not in (7, 11)]
+    assert recording.t == pytest.approx(t[rows])
+    for i in (6, 8, 10, 12):
+        assert recording.frame_at(t[i]).head[0] == pytest.approx(i / FPS)
+
+
+@pytest.mark.parametrize("broken", [np.zeros(LENGTH), np.full(LENGTH, np.nan)])
+def test_robot_without_a_clock_has_the_hosts(broken: np.ndarray) -> None:
+    recording, _ = make_dataset_recording(make_columns(**{"time.sim": broken[:, None]}), {}, "x")
+    assert recording.t == pytest.approx(np.arange(LENGTH) * 0.05)
+    columns = make_columns(**{"time.sim": broken[:, None]})
+    del columns["time.wall"]
+    with pytest.raises(BadRecording, match=r"'x': no clock of it runs\. Tried: time\.sim"):
+        make_dataset_recording(columns, {}, "x")
+
+
+def test_limb_that_is_not_seen_may_hold_anything() -> None:
+    tracked = np.ones((LENGTH, 3), bool)
+    tracked[5:9, 2] = False
+    wrist = make_columns()["operator.right_wrist"].copy()
+    wrist[5:7], wrist[7:9] = np.nan, 0.3
+    columns = make_columns(**{"operator.tracked": tracked, "operator.right_wrist": wrist})
+    recording, _ = make_dataset_recording(columns, {}, "x")
+    assert recording.poses[5:9, 2, 0] == pytest.approx(4 / FPS)
+    with pytest.raises(BadRecording, match=r"right_wrist_pose must be finite"):
+        make_dataset_recording(make_columns(**{"operator.right_wrist": wrist}), {}, "x")
+
+
 def test_faults_are_named(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "set")
     with pytest.raises(BadRecording, match=r"it has no episode 7 \(it has 2 episodes\)"):
@@ -96,6 +155,9 @@ def test_faults_are_named(tmp_path: Path) -> None:
     idle = write_dataset(tmp_path / "idle", engages=False)
     with pytest.raises(BadRecording, match=r"\(episode 0\)': the operator never engaged in it"):
         load_dataset_recording(idle)
+    once = np.arange(LENGTH)[:, None] == 3
+    with pytest.raises(BadRecording, match=r"was engaged in a single row of it"):
+        make_dataset_recording(make_columns(**{"operator.engaged": once}), {}, "x")
     (root / "meta" / "info.json").write_text("{")
     with pytest.raises(BadRecording, match=r"meta/info\.json is not readable"):
         load_dataset_recording(root)

@@ -230,6 +230,24 @@ def test_a_lost_head_stops_the_robot_and_the_next_engagement_aligns_anew(rig, na
     assert len(r.person.starts) == 1  # a recording is not rewound
 
 
+def test_who_lets_go_though_seen_stops_the_robot_and_takes_it_up_anew(rig):
+    r = rig("rby1", mode="mobile")
+    start = r.loop.state.time
+    r.person.motion = lambda t: make_frame(t, (0.4 * (t - start), 0, 1.7))
+    driven = r.run(0.8)
+    r.person.is_paused = lambda time: True
+    let_go = r.run(0.8)
+    assert not any(record.engaged for _, record in let_go)
+    # The frames are there all the same, and count for nothing.
+    assert let_go[-1][1].frame is not None and let_go[-1][1].goal is None
+    r.person.is_paused = lambda time: False
+    again = r.run(0.4)
+    first = again[0][1]
+    assert first.engaged
+    np.testing.assert_allclose(first.goal.poses["head"], r.place(first.estimate)["head"], atol=1e-9)
+    assert_no_step(r, driven + let_go + again)
+
+
 def test_a_lost_hand_does_not_end_the_engagement(rig):
     r = rig("rby1")
     r.run(0.2)

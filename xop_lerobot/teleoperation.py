@@ -254,11 +254,12 @@ class Teleoperation:
         self, state: RobotState, frame: OperatorFrame | None, poses: Mapping[str, np.ndarray]
     ) -> OperatorFrame | None:
         """Engage or disengage where it is time to; return the frame to use."""
+        is_over = state.fallen or self.device.is_paused(state.time)
         if self.alignment.is_engaged:
-            if frame is None or is_lost(frame) or state.fallen:
+            if frame is None or is_lost(frame) or is_over:
                 self.disengage()
             return frame
-        if not self.device.self_engaging or not state.settled or state.fallen:
+        if not self.device.self_engaging or not state.settled or is_over:
             return frame
         if not self._started:
             self.device.start(state.time)

@@ -1,22 +1,39 @@
-"""The operator's columns of a recorded LeRobot dataset, read as an operator recording."""
+"""The operator's columns of a recorded LeRobot dataset, read as an operator recording.
+
+Recordings of hardware are not as even as those of a simulation: tracking drops out, the person
+lets go of the robot and takes it up again, and clocks jitter. All of that plays as it was.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from xop_lerobot.command import MODE_KEY
 from xop_lerobot.errors import BadRecording
-from xop_lerobot.operator.recording import Recording, make_recording
+from xop_lerobot.operator.recording import (
+    MIN_SAMPLES,
+    NORM_TOLERANCE,
+    Recording,
+    make_recording,
+)
 from xop_lerobot.state import FRAMES
 from xop_lerobot.transforms import IDENTITY_POSE
 
 POSE_COLUMNS = tuple(f"operator.{frame}" for frame in FRAMES)
 COLUMNS = (*POSE_COLUMNS, "operator.pinch", "operator.tracked")
 ENGAGED_COLUMN = "operator.engaged"
-TIME_COLUMNS = ("time.sim", "timestamp")
+CLOCKS = {"time.sim": 1.0, "time.wall": 1e-9, "timestamp": 1.0}
+"""Columns that tell the time, best first, and the seconds that one of their units is. Of a robot
+without a clock of its own the first stands still."""
+OPTIONAL_COLUMNS = (ENGAGED_COLUMN, "action", *CLOCKS)
+_MOST = 0.9
+"""Share of the rows in which a clock must go on to be used."""
 
 
 def is_dataset(path: str | Path) -> bool:
@@ -38,9 +55,23 @@ def load_dataset_recording(root: str | Path, episode: int = 0) -> Recording:
         BadRecording: If the dataset has no operator columns, no such episode, or bad data.
     """
     root = Path(root)
-    source = f"{root} (episode {episode})"
     info = _read_info(root)
     features = info["features"]
+    wanted = choose_columns(root, features)
+    arrays = _read_episode(root, wanted, episode, info)
+    return make_dataset_recording(arrays, features, f"{root} (episode {episode})")[0]
+
+
+def choose_columns(root: object, features: Mapping[str, Any]) -> list[str]:
+    """Name the columns that a recording is made from.
+
+    Args:
+        root: The dataset, for the message.
+        features: Its features.
+
+    Raises:
+        BadRecording: If it lacks one that is needed.
+    """
     missing = [column for column in COLUMNS if column not in features]
     if missing:
         raise BadRecording(
@@ -48,31 +79,85 @@ def load_dataset_recording(root: str | Path, episode: int = 0) -> Recording:
             f"the dataset has no column {', '.join(missing)}. Its columns: "
             f"{', '.join(sorted(features))}",
         )
-    time_column = next(name for name in TIME_COLUMNS if name in features or name == "timestamp")
-    wanted = [*COLUMNS, time_column]
-    wanted += [name for name in (ENGAGED_COLUMN, "action") if name in features]
-    table = _read_episode(root, wanted, episode, info)
+    return [*COLUMNS, *(column for column in OPTIONAL_COLUMNS if column in features)]
 
-    engaged = table[ENGAGED_COLUMN][:, 0] if ENGAGED_COLUMN in table else np.ones(len(table["t"]))
-    if not (engaged > 0).any():
+
+def make_dataset_recording(
+    columns: Mapping[str, np.ndarray], features: Mapping[str, Any], source: object
+) -> tuple[Recording, np.ndarray]:
+    """Make a recording of an episode's columns.
+
+    It reaches from the first row in which the operator drove to the last. Rows in which the clock
+    stands still or goes back are left out.
+
+    Args:
+        columns: The columns of `choose_columns`. Shapes (n, size).
+        features: The dataset's features.
+        source: What they came from, for the messages.
+
+    Returns:
+        The recording, and the row of each of its samples. Shape (T,).
+
+    Raises:
+        BadRecording: If nobody drove, no clock runs, or the data are bad.
+    """
+    engaged = np.ones(len(columns["operator.tracked"]), bool)
+    if ENGAGED_COLUMN in columns:
+        engaged = columns[ENGAGED_COLUMN][:, 0] > 0
+    if not engaged.any():
         raise BadRecording(source, "the operator never engaged in it")
-    rows = slice(int(np.argmax(engaged > 0)), None)
-    tracked = table["operator.tracked"][rows] > 0
+    driven = np.flatnonzero(engaged)
+    span = np.arange(driven[0], driven[-1] + 1)
+    if len(span) < MIN_SAMPLES:
+        raise BadRecording(source, "the operator was engaged in a single row of it")
+    t, goes_on = _choose_clock({name: columns[name][span, 0] for name in CLOCKS if name in columns})
+    if t is None:
+        tried = ", ".join(name for name in CLOCKS if name in columns)
+        raise BadRecording(source, f"no clock of it runs. Tried: {tried or '(it has none)'}")
+    rows = span[goes_on]
+    tracked = columns["operator.tracked"][rows] > 0
     arrays = {
-        "t": table["t"][rows],
-        "left_pinch": table["operator.pinch"][rows, 0],
-        "right_pinch": table["operator.pinch"][rows, 1],
+        "t": t[goes_on],
+        "left_pinch": columns["operator.pinch"][rows, 0],
+        "right_pinch": columns["operator.pinch"][rows, 1],
         "tracked": tracked,
     }
     for limb, frame in enumerate(FRAMES):
-        poses = table[f"operator.{frame}"][rows]
+        poses = np.asarray(columns[f"operator.{frame}"][rows], float)
         # Columns hold zeros where the device gave nothing; the flag says so.
-        empty = ~tracked[:, limb] & ~poses[:, 3:].any(axis=1)
-        arrays[f"{frame}_pose"] = np.where(empty[:, None], IDENTITY_POSE, poses)
-    names = (features.get("action") or {}).get("names") or []
-    if "action" in table and MODE_KEY in names:
-        arrays["mode"] = np.round(table["action"][rows, list(names).index(MODE_KEY)])
-    return make_recording(arrays, source)
+        unknown = ~tracked[:, limb] & ~_is_pose(poses)
+        arrays[f"{frame}_pose"] = np.where(unknown[:, None], IDENTITY_POSE, poses)
+    names: Sequence[str] = (features.get("action") or {}).get("names") or ()
+    if "action" in columns and MODE_KEY in names:
+        arrays["mode"] = np.round(columns["action"][rows, list(names).index(MODE_KEY)])
+    recording = make_recording(arrays, source)
+    return dataclasses.replace(recording, engaged=engaged[rows]), rows
+
+
+def _is_pose(poses: np.ndarray) -> np.ndarray:
+    """Whether rows are finite poses with a unit quaternion. Shape (n, 7) -> (n,)."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        norm = np.linalg.norm(poses[:, 3:], axis=1)
+        return np.isfinite(poses).all(axis=1) & (np.abs(norm - 1) <= NORM_TOLERANCE)
+
+
+def _choose_clock(clocks: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
+    """Choose the best clock that runs.
+
+    Args:
+        clocks: Columns of `CLOCKS`. Shapes (n,).
+
+    Returns:
+        Its time [s], None if none runs, and the rows in which it went on. Shapes (n,).
+    """
+    for name, ticks in clocks.items():
+        # Whole nanoseconds since 1970 are too many for a float: from the first on they are not.
+        t = (ticks - ticks[0]) * CLOCKS[name]
+        before = np.concatenate([[-np.inf], np.fmax.accumulate(t)[:-1]])
+        goes_on = np.isfinite(t) & (t > before)
+        if goes_on.sum() >= max(2, _MOST * len(t)):
+            return t, goes_on
+    return None, np.zeros(0, bool)
 
 
 def _read_info(root: Path) -> dict:
@@ -88,7 +173,7 @@ def _read_info(root: Path) -> dict:
 def _read_episode(
     root: Path, columns: list[str], episode: int, info: dict
 ) -> dict[str, np.ndarray]:
-    """Return the columns of one episode, each of shape (T, size), and the time as `t` (T,)."""
+    """Return the columns of one episode, each of shape (n, size)."""
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
@@ -106,8 +191,6 @@ def _read_episode(
     table = pa.concat_tables(parts)
     arrays = {}
     for column in columns:
-        values = np.array(table[column].to_pylist(), dtype=float)
+        values = np.array(table[column].to_pylist())
         arrays[column] = values.reshape(len(values), -1)
-    time_column = next(name for name in columns if name in TIME_COLUMNS)
-    arrays["t"] = arrays.pop(time_column)[:, 0]
     return arrays

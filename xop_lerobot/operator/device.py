@@ -43,6 +43,11 @@ class Device(ABC):
         del time
         return False
 
+    def is_paused(self, time: float) -> bool:
+        """Whether the person, though seen, lets go of the robot for now; the robot holds."""
+        del time
+        return False
+
     def see(self, view: View) -> None:
         """Look at the robot and what is about it; only a simulated person needs to."""
         del view

@@ -35,6 +35,7 @@ class Recording:
         pinch: Distance of thumb and index tip, left and right [m]. Shape (T, 2).
         tracked: Whether each limb was seen. Shape (T, 3), bool.
         mode: 0 stationary, 1 mobile; None where the recording states none. Shape (T,).
+        engaged: Whether the person drove; None where they did all the time. Shape (T,), bool.
     """
 
     t: np.ndarray
@@ -42,11 +43,20 @@ class Recording:
     pinch: np.ndarray
     tracked: np.ndarray
     mode: np.ndarray | None = None
+    engaged: np.ndarray | None = None
 
     @property
     def duration(self) -> float:
         """Length [s]."""
         return float(self.t[-1])
+
+    def is_engaged_at(self, stamp: float) -> bool:
+        """Whether the person drove at `stamp` [s]: as in the last sample before."""
+        if self.engaged is None:
+            return True
+        # Lock-step clocks add up rounding; a nanosecond must not cost a tick.
+        last = np.searchsorted(self.t, stamp + 1e-9, side="right") - 1
+        return bool(self.engaged[max(int(last), 0)])
 
     def frame_at(self, stamp: float) -> OperatorFrame:
         r"""Interpolate at any time; before the first and after the last sample these are held.

@@ -64,5 +64,9 @@ class ReplayDevice(Player):
         """Frame at `stamp` [s] of the recording's clock."""
         return self.recording.frame_at(stamp)
 
+    def is_paused(self, time: float) -> bool:
+        """Whether the person of the recording had let go of their robot."""
+        return not self.recording.is_engaged_at(self.elapsed(time))
+
 
 DEVICES.add("replay", ReplayDevice)
