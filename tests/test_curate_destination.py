@@ -13,7 +13,7 @@ import pytest
 from xop_lerobot.dataset.collect_folder import FolderTaken
 from xop_lerobot.dataset.curate import destination as module
 from xop_lerobot.dataset.curate.destination import Destination
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.errors import XopError
 
 REPO = Path(__file__).parents[1]
 
@@ -179,7 +179,7 @@ def test_place_that_cannot_be_written(source, tmp_path):
     blocker = tmp_path / "file"
     blocker.write_text("")
     with (
-        pytest.raises(BadValue, match=f"nothing can be written beside '{blocker / 'out'}'"),
+        pytest.raises(XopError, match=f"nothing can be written beside '{blocker / 'out'}'"),
         Destination(blocker / "out", source),
     ):
         pass

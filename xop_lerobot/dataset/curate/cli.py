@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from xop_lerobot.command_line import CommandParser
 from xop_lerobot.dataset.curate.verbs import VERBS, Verb, load_verb
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.errors import BadValue, UnknownName, XopError
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C or SIGTERM, as shells have it."""
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (XopError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
+        return WRONG_USAGE if isinstance(error, BadValue | UnknownName) else 1
 
 
 if __name__ == "__main__":

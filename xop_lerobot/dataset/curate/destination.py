@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import IO
 
 from xop_lerobot.dataset.collect_folder import FolderTaken, sync_folder, sync_tree
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.errors import XopError
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -87,7 +87,7 @@ class Destination:
             raise
         except OSError as error:
             self._clean_up()
-            raise BadValue(f"nothing can be written beside '{self.root}': {error}") from error
+            raise XopError(f"nothing can be written beside '{self.root}': {error}") from error
         return self.draft
 
     def __exit__(

@@ -21,6 +21,8 @@ from xop_lerobot.errors import UnknownName
 
 _PACKAGE = "xop_lerobot.dataset.curate"
 VERBS = {
+    "inspect": "inspect",
+    "filter": "filter",
     "trim": "trim",
     "merge": "merge",
     "split": "split",

@@ -1,0 +1,82 @@
+"""Whether the videos of a dataset are there and as long as its metadata says."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import av
+
+from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
+
+_HEAD = 8
+"""Bytes of the size and the name of a box."""
+_SLACK = 0.5
+"""Frames by which a video may end early without a picture being missed: half of one."""
+
+
+class VideoCheck:
+    """Looks at the heads of videos, without decoding a picture; each file once.
+
+    Args:
+        source: The dataset.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._last: dict[str, tuple[Path, str, float]] = {}
+
+    def check(self, entry: EpisodeEntry) -> list[str]:
+        """Say what is wrong with the videos of an episode; empty if nothing is."""
+        problems = []
+        dt = 1 / self._source.fps
+        for key, span in entry.videos.items():
+            if self._last.get(key, (None,))[0] != span.file:
+                self._last[key] = (span.file, *_probe(self._source.root / span.file))
+            _, fault, end = self._last[key]
+            frames = (span.stop - span.start) / dt
+            if fault:
+                problems.append(f"{span.file} is not readable ({fault})")
+            elif end < span.stop - _SLACK * dt:
+                problems.append(
+                    f"{span.file} ends at {end:.2f} s, episode {entry.index} needs it until "
+                    f"{span.stop:.2f} s"
+                )
+            elif abs(frames - entry.length) > _SLACK:
+                problems.append(
+                    f"episode {entry.index} has {entry.length} frames, but {frames:g} pictures of "
+                    f"'{key}'"
+                )
+        return problems
+
+
+def _probe(path: Path) -> tuple[str, float]:
+    """Return what is wrong with a file, empty if nothing, and when its pictures end [s]."""
+    if not path.is_file():
+        return "there is no such file", 0.0
+    try:
+        if _is_cut_off(path):
+            return "it is cut off", 0.0
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                return "it has no video", 0.0
+            stream = container.streams.video[0]
+            if stream.duration and stream.time_base:
+                return "", float((stream.duration + (stream.start_time or 0)) * stream.time_base)
+            return "", stream.frames / float(stream.average_rate or 1)
+    except (av.FFmpegError, OSError, ValueError) as error:
+        return getattr(error, "strerror", None) or str(error), 0.0
+
+
+def _is_cut_off(path: Path) -> bool:
+    """Whether the last of the boxes that an MP4 file consists of reaches beyond its end."""
+    size, place = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while place + _HEAD <= size:
+            file.seek(place)
+            length, kind, long = struct.unpack(">I4sQ", file.read(2 * _HEAD).ljust(2 * _HEAD))
+            if not kind.isalnum():  # no MP4: whether it is a video at all is for FFmpeg to say
+                return False
+            length = {0: size - place, 1: long}.get(length, length)
+            place += max(length, _HEAD)
+    return place != size
