@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import logging
 import os
 import shutil
 import signal
@@ -45,6 +46,12 @@ if TYPE_CHECKING:
 
 FPS = 25
 RATE_HZ = 50
+HANDS = {
+    "left": ((0.152, 0.233, -0.561), (0.738, -0.656, 0.102, 0.122)),
+    "right": ((0.152, -0.233, -0.561), (0.738, 0.656, 0.102, -0.122)),
+}
+"""Wrists from the head [m], and wxyz: as a G1 holds them at rest, so that its arms need not move
+when the person engages."""
 KILLED_EPISODES = 3
 """Episodes that a killed session had saved."""
 SESSION = "mixed"
@@ -150,8 +157,8 @@ def make_motion(kind: Kind, rng: np.random.Generator) -> dict[str, np.ndarray]:
     pose[:, :3] += sway(0.002)
     pose[:, 2] -= lowered
     motion = {"t": t, "head_pose": pose}
-    for side, y in (("left", 0.2), ("right", -0.2)):
-        wrist = pose + [0.3, y, -0.45, 0, 0, 0, 0]
+    for side, (offset, quat) in HANDS.items():
+        wrist = np.concatenate([pose[:, :3] + offset, np.tile(quat, (len(t), 1))], axis=1)
         wrist[:, :3] += sway(0.001)
         wrist[:, 0] += 0.5 * lowered
         motion |= {f"{side}_wrist_pose": wrist, f"{side}_pinch": np.full(len(t), 0.08)}
@@ -335,6 +342,7 @@ def _calm_down() -> None:
     import av.logging
 
     av.logging.set_libav_level(av.logging.ERROR)
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
 
 def make_all(args: argparse.Namespace, session: Path, size: tuple[int, int]) -> None:
