@@ -32,6 +32,7 @@ from xop_lerobot.errors import BadDataset, XopError
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip
+    from xop_lerobot.dataset.curate.survey import Finding
 
 SUMMARY = "keep the episodes for which an expression over these figures holds"
 
@@ -75,6 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
                 with destination as draft:
                     transfer(_make_clips(choice, entries), draft, step)
             except BadDataset as error:
+                if choice.failed:  # on the metadata, which no expression mends
+                    raise
                 hint = f'--where "({expression.text}) and readable" leaves such episodes out'
                 raise BadDataset(error.root, f"{error.fault}. {hint}") from error
     choice.report()
@@ -98,12 +101,17 @@ class Filter:
         source: The dataset.
         expression: Which episodes are kept.
         keep_unknown: Whether those are kept too for which that is not known.
+
+    Attributes:
+        source: The dataset.
+        failed: Whether it was the choice that met with an error, and not who took the episodes.
     """
 
     def __init__(
         self, source: Source, expression: Expression, *, keep_unknown: bool = False
     ) -> None:
         self.source, self._expression, self._keep_unknown = source, expression, keep_unknown
+        self.failed = False
         self._kept = self._dropped = self._unknown = 0
         self._seconds = self._kept_seconds = 0.0
         self._listed: list[int] = []
@@ -113,7 +121,7 @@ class Filter:
         """Choose the episodes that are kept, one at a time."""
         from xop_lerobot.dataset.curate.survey import survey  # noqa: PLC0415 SciPy, MuJoCo
 
-        findings = survey(self.source, self._expression.names)
+        findings = self._guard(survey(self.source, self._expression.names))
         total = self.source.total_episodes
         for finding in show_progress(findings, total, "episode", quiet=quiet):
             for problem in finding.problems:
@@ -121,6 +129,13 @@ class Filter:
             result = self._expression.evaluate(finding.figures)
             if self._note(finding.entry, result, finding.figures):
                 yield finding.entry
+
+    def _guard(self, findings: Iterator[Finding]) -> Iterator[Finding]:
+        try:
+            yield from findings
+        except BadDataset:
+            self.failed = True
+            raise
 
     def _note(self, entry: EpisodeEntry, result: bool | None, figures: dict) -> bool:
         seconds = entry.length / self.source.fps
