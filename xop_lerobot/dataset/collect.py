@@ -15,12 +15,12 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from xop_lerobot.command_line import CommandParser
 from xop_lerobot.dataset.collect_config import CollectConfig
+from xop_lerobot.dataset.collect_flags import add_config, add_crew, read_config
 from xop_lerobot.dataset.collect_folder import CollectFolder
 from xop_lerobot.dataset.collect_jobs import WorkerFailed
 from xop_lerobot.dataset.collect_run import run_collection
@@ -97,58 +97,30 @@ def collect(
 def make_parser() -> CommandParser:
     """Make the parser of the command line."""
     parser = CommandParser("xop-collect", __doc__)
-    defaults = {each.name: each.default for each in fields(CollectConfig)}
-
-    def add(name: str, text: str, **options: Any) -> None:
-        key = name.replace("-", "_")
-        if key in defaults and not options.get("required") and "action" not in options:
-            options["default"] = defaults[key]
-        if not options.get("required") and "default" in options:
-            shown = options["default"]
-            shown = ",".join(shown) if isinstance(shown, tuple) else shown
-            text = f"{text} (default: {shown or 'none'})" if shown != 0 else f"{text} (default: 0)"
-        parser.add_argument(f"--{name}", help=text, **options)
-
-    add("robot", "robot: g1 or rby1", required=True)
-    add("task", "dual_point_touch, box_pick_and_place or non_prehensile_transport", required=True)
-    add("episodes", "how many episodes there shall be", required=True, type=int)
-    add("root", "directory of the dataset", required=True, type=Path)
-    add("repo-id", "name of the dataset; empty: local/<directory>", default="")
-    add("seed", "seed of all that is random", type=int)
-    add_crew(parser)
-    add("cameras", "cameras, with commas between", type=_split)
-    add("low-level", "low-level policy; default: the robot's own")
-    add("low-level-path", "file of the low-level policy; empty: its default")
-    add("fps", "rate of control and dataset [Hz]; divides 50", type=int)
-    add("width", "width of a picture [pixel]", type=int)
-    add("height", "height of a picture [pixel]", type=int)
-    add("noise", "noise of the sensors: off, mild or harsh")
-    add("method", "mpc, mpc_no_sync, mpc_table1, direct or direct_amo")
-    add("variant", "binding, constraints and preset with _ between, such as v2_upright")
-    add("scene", "scene; empty: the task's own")
-    add("device", "operator device: simulated, or one of a plugin")
-    add("plugins", "modules to import first, with commas between", type=_split)
-    add("only-successful", "leave episodes without success out", action="store_true")
-    add("images", "store pictures as PNG and not as h264 video", action="store_true")
-    return parser
-
-
-def add_crew(parser: CommandParser) -> None:
-    """Add `--workers` and `--ray`, which say who makes the episodes."""
-    parser.add_argument(
-        "--workers", type=int, default=0, help="processes; 0: one per core (default: 0)"
+    add = parser.add_argument
+    add("--robot", required=True, help="robot: g1 or rby1")
+    add(
+        "--task",
+        required=True,
+        help="dual_point_touch, box_pick_and_place or non_prehensile_transport",
     )
-    parser.add_argument(
-        "--ray",
+    add("--episodes", required=True, type=int, help="how many episodes there shall be")
+    add("--root", required=True, type=Path, help="directory of the dataset")
+    add(
+        "--repo-id",
         default="",
-        metavar="ADDRESS",
-        help="make the episodes on a Ray cluster: local, auto, HOST:PORT or ray://HOST:PORT "
-        "(default: none)",
+        help="name of the dataset; empty: local/<directory> (default: none)",
     )
-
-
-def _split(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.strip("[] ").split(",") if name.strip())
+    add_crew(parser)
+    add_config(parser)
+    device = CollectConfig.device
+    add(
+        "--device",
+        default=device,
+        help=f"operator device: simulated, or one of a plugin (default: {device})",
+    )
+    add("--only-successful", action="store_true", help="leave episodes without success out")
+    return parser
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[CollectConfig, argparse.Namespace]:
@@ -159,9 +131,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[CollectConfig, argparse.N
         UnknownName: If one is unknown, listing the known ones.
     """
     args = make_parser().parse(arguments)
-    names = {each.name for each in fields(CollectConfig)} - {"video"}
-    values = {name: getattr(args, name) for name in names}
-    return CollectConfig(**values, video=not args.images), args
+    return read_config(CollectConfig, args), args
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

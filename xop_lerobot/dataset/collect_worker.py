@@ -60,7 +60,7 @@ class Collector:
         """Make an episode.
 
         Args:
-            job: Index of the episode.
+            job: The episode: its index, or what has one.
             folder: Directory of its own; the episode is the dataset `DATASET` in it.
         """
         cpu = time.process_time()
@@ -68,11 +68,11 @@ class Collector:
         teleop: Xop = make_device_from_device_class(self.config.make_teleop_config())
         # LeRobot's own loop is not used here, so it needs no help.
         teleop.host.remove()
-        self.prepare(job, teleop)
         teleop.connect()
         try:
             dataset = self._create(folder / DATASET)
             try:
+                self.begin(job, teleop, dataset)
                 frames = self._run(job, teleop, dataset)
                 outcome = self.session.outcome
                 success = outcome is not None and outcome.success
@@ -129,8 +129,8 @@ class Collector:
 
     # What depends on the kind of collection.
 
-    def prepare(self, job: Any, teleop: Xop) -> None:
-        """Do what must be done before the teleoperator of an episode is connected."""
+    def begin(self, job: Any, teleop: Xop, dataset: XopDataset) -> None:
+        """Do what must be done before the first frame of an episode."""
 
     def get_limit(self, job: Any) -> int:
         """Frames after which an episode is ended in any case."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 FACTS_DIR = Path("meta") / "xop"
@@ -81,11 +82,26 @@ FACT_COLUMNS = tuple(f"{FACTS_PREFIX}{each.name}" for each in dataclasses.fields
 """Names of the facts in LeRobot's episode metadata."""
 
 
-def append_facts(root: Path, episode: int, length: int, facts: EpisodeFacts) -> None:
-    """Add the line of `episode`, which has `length` frames, and see it on the disk."""
+def append_facts(
+    root: Path,
+    episode: int,
+    length: int,
+    facts: EpisodeFacts,
+    more: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Add the line of `episode`, which has `length` frames, and see it on the disk.
+
+    Args:
+        root: Directory of the dataset.
+        episode: Index of the episode.
+        length: Its frames.
+        facts: The facts.
+        more: Facts that not every episode has, fit for JSON.
+    """
     row = {"episode_index": episode, "length": length, **dataclasses.asdict(facts)}
     for name in _JSON_FACTS:
         row[name] = json.loads(row[name])
+    row |= more
     path = root / EPISODES_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as file:

@@ -11,8 +11,9 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Self, cast
 
 from lerobot.datasets import LeRobotDataset
@@ -23,6 +24,7 @@ from xop_lerobot.dataset.columns import Columns, has_all_columns, is_own_column
 from xop_lerobot.dataset.embedding import skip_embedding
 from xop_lerobot.dataset.facts import (
     FACT_COLUMNS,
+    FACTS_PREFIX,
     EpisodeFacts,
     append_facts,
     compute_config_hash,
@@ -67,10 +69,12 @@ class XopDataset(LeRobotDataset):
     Attributes:
         session_name: Session whose robot and teleoperator are recorded.
         extra_columns: Whether to record the columns of `xop_lerobot.dataset.columns`.
+        more_facts: Facts on the next episode that only who records it knows, fit for JSON.
     """
 
     session_name: ClassVar[str] = "default"
     extra_columns: ClassVar[bool] = True
+    more_facts: Mapping[str, Any] = MappingProxyType({})
 
     _session: Session
     _info: RobotInfo
@@ -171,6 +175,8 @@ class XopDataset(LeRobotDataset):
             """Save an episode's metadata, with what is known of it as a whole."""
             if self._keep_facts:
                 episode_metadata = {**episode_metadata, **self._collect_facts().to_metadata()}
+                for key, value in self.more_facts.items():
+                    episode_metadata[FACTS_PREFIX + key] = json.dumps(value)
             stock(episode_index, episode_length, episode_tasks, episode_stats, episode_metadata)
 
         # An instance attribute, so that other datasets of the process are untouched.
@@ -256,7 +262,7 @@ class XopDataset(LeRobotDataset):
             super().save_episode(episode_data, parallel_encoding)
             self._own_root = False
             self._secure()
-            append_facts(self.root, index, length, facts)
+            append_facts(self.root, index, length, facts, self.more_facts)
         if facts.dropped_frames or facts.late:
             logger.warning(
                 "Episode %d dropped %d video frames and ran at %.1f Hz of %d; it is marked so.",
@@ -335,5 +341,6 @@ _KEPT = (
     "_stop_on_success",
     "_events",
     "_config_hash",
+    "more_facts",
 )
 """Attributes that outlive a change of writer."""
