@@ -80,11 +80,13 @@ class Step:
         verb: Verb of `xop-curate`.
         arguments: Its flags that decide the content.
         versions: Versions of the packages that did it.
+        root: Directory that the episodes are said to be from, where that is not their source's.
     """
 
     verb: str
     arguments: Mapping[str, Any]
     versions: Mapping[str, str]
+    root: Path | None = None
 
     @classmethod
     def now(cls, verb: str, **arguments: Any) -> Step:
@@ -108,7 +110,7 @@ def make_facts(clip: Clip, step: Step) -> dict[str, Any]:
     record = {
         "verb": step.verb,
         "arguments": dict(step.arguments),
-        "source": name_source(clip.source.root),
+        "source": name_source(step.root or clip.source.root),
         "source_episode": clip.entry.index,
         "source_rows": [start, stop],
         "versions": dict(step.versions),

@@ -70,13 +70,15 @@ def index_video(root: Path, file: Path) -> VideoIndex:
             for packet in container.demux(stream):
                 if packet.pts is None or packet.dts is None:
                     continue
+                if packet.is_corrupt:  # the file is cut off in it
+                    break
                 pts.append(packet.pts)
                 keys.append(packet.is_keyframe)
             time_base = stream.time_base or Fraction(1, 1)
     except FileNotFoundError:
         raise BadDataset(root, f"{file} is missing") from None
     except (av.FFmpegError, OSError, IndexError, ValueError) as error:
-        raise BadDataset(root, f"{file} is not readable ({error})") from error
+        raise BadDataset(root, f"{file} is not readable ({_say(error)})") from error
     return VideoIndex(np.array(pts, np.int64), np.array(keys, bool), time_base)
 
 
@@ -212,4 +214,9 @@ def decode(cut: Cut, fps: float, wanted: set[int]) -> Iterator[tuple[int, np.nda
                 if not left or time > cut.stop - cut.start:
                     return
     except (av.FFmpegError, OSError, IndexError) as error:
-        raise BadDataset(cut.root, f"{cut.file} is not readable ({error})") from error
+        raise BadDataset(cut.root, f"{cut.file} is not readable ({_say(error)})") from error
+
+
+def _say(error: Exception) -> str:
+    """Say what is wrong, without number and path."""
+    return getattr(error, "strerror", None) or str(error)

@@ -26,6 +26,8 @@ VERBS = {
     "trim": "trim",
     "merge": "merge",
     "split": "split",
+    "retarget": "retarget",
+    "repair": "repair",
 }
 """Module of each verb, in the order of the list."""
 
