@@ -121,13 +121,15 @@ def _open_list(file: str | None) -> Iterator[Any]:
     draft = path.with_name(f".{path.name}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with draft.open("w", encoding="utf-8") as stream:
+        stream = draft.open("w", encoding="utf-8")
+    except OSError as error:
+        raise BadValue(f"--json={file} cannot be written: {error}") from error
+    try:
+        with stream:
             writer = _ListWriter(stream)
             yield writer.write
             writer.close()
         os.replace(draft, path)
-    except OSError as error:
-        raise BadValue(f"--json={file} cannot be written: {error}") from error
     finally:
         draft.unlink(missing_ok=True)
 

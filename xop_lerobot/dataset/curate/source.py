@@ -99,7 +99,7 @@ class Source:
 
         Returns:
             An array for each column, with a row for each frame, of the file's dtype and always
-            of two dimensions. Shape (n, size).
+            of two dimensions; it may be read-only. Shape (n, size).
 
         Raises:
             BadDataset: If the dataset has not these columns, or the file is malformed.

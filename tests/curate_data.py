@@ -1,0 +1,79 @@
+"""Small datasets for the tests of curation: synthetic ones, and foreign ones."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+# LeRobot makes folders under its home at import.
+os.environ.setdefault("HF_LEROBOT_HOME", tempfile.mkdtemp(prefix="lerobot-"))
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets import LeRobotDataset
+
+from xop_lerobot.dataset.curate.synthetic import make_dataset
+
+SIZE = 32
+
+
+def make_synthetic(root: Path, episodes: int = 4, frames: int = 100, **options: Any) -> Path:
+    """A synthetic dataset of this project's columns, without pictures."""
+    make_dataset(root, episodes, frames, **options)
+    return root
+
+
+def make_foreign(root: Path, episodes: int = 2, frames: int = 30, *, video: bool = True) -> Path:
+    """A dataset as stock LeRobot records it with somebody else's robot."""
+    features: dict[str, dict] = {
+        "action": {"dtype": "float32", "shape": (3,), "names": ["a.pos", "b.pos", "c.pos"]},
+        "observation.state": {"dtype": "float32", "shape": (2,), "names": None},
+    }
+    if video:
+        features["observation.images.cam"] = {
+            "dtype": "video", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"],
+        }  # fmt: skip
+    dataset = LeRobotDataset.create(
+        "somebody/else", 10, features, root=root, robot_type="so101", use_videos=video
+    )
+    rng = np.random.default_rng(0)
+    for episode in range(episodes):
+        for frame in range(frames):
+            t = frame / 10
+            row: dict[str, Any] = {
+                "action": np.array([np.sin(t), 0.5, np.cos(2 * t)], np.float32),
+                "observation.state": rng.normal(size=2).astype(np.float32),
+                "task": f"task {episode}",
+            }
+            if video:
+                row["observation.images.cam"] = rng.integers(0, 255, (SIZE, SIZE, 3), np.uint8)
+            dataset.add_frame(row)
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def compute_digests(root: Path) -> dict[str, str]:
+    """SHA-256 of every file under `root`, by its path in it."""
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
+
+
+def rewrite(path: Path, columns: Mapping[str, Any], drop: tuple[str, ...] = ()) -> None:
+    """Write a parquet file anew with other columns; values are arrays of pyarrow or lists."""
+    table = pq.read_table(path).drop_columns(list(drop))
+    for name, values in columns.items():
+        array = values if isinstance(values, pa.Array) else pa.array(values)
+        if name in table.column_names:
+            table = table.set_column(table.column_names.index(name), name, array)
+        else:
+            table = table.append_column(name, array)
+    pq.write_table(table.replace_schema_metadata(None), path)
