@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from xop_lerobot.errors import BadShape, BadValue
 from xop_lerobot.transforms import quat_rotate, rotation_error
@@ -105,6 +104,8 @@ def compute_jerk(
         BadShape: If the shapes do not fit.
         BadValue: If the filter has fewer points than its polynomial needs.
     """
+    from scipy.signal import savgol_filter  # noqa: PLC0415 most of a second, for this one figure
+
     if position.ndim != 2 or position.shape[1] != 3:  # noqa: PLR2004
         raise BadShape("position", ("n", 3), position.shape)
     size = 2 * round(window_s / dt / 2) + 1
