@@ -33,6 +33,7 @@ from xop_lerobot.dataset.curate.episode_stats import (
 )
 from xop_lerobot.dataset.curate.pictures import Cut, decode
 from xop_lerobot.dataset.curate.row_files import RowFiles
+from xop_lerobot.dataset.curate.subtasks import SUBTASK, read_subtasks, write_subtasks
 from xop_lerobot.dataset.curate.video_files import VideoFiles
 from xop_lerobot.dataset.facts import (
     CONFIG_FILE,
@@ -145,12 +146,15 @@ class _Writer:
             key: VideoFiles(root, template, size, key, source.fps) for key in meta.video_keys
         }
         self._sources: dict[Path, _SourceParts] = {}
+        self._subtasks: list[str] = []
         self._has_facts = bool(first.entry.facts)
         (root / FACTS_DIR).mkdir(parents=True)
         self._facts = (root / EPISODES_FILE).open("w", encoding="utf-8")
 
     def close(self) -> None:
         """Finish all files."""
+        if self._subtasks:
+            write_subtasks(self._root, self._subtasks)
         for part in (self._rows, *self._videos.values(), self._facts):
             part.close()
         self.meta.finalize()
@@ -163,6 +167,8 @@ class _Writer:
         tasks = parts.name_tasks(table, clip)
         self.meta.save_episode_tasks(list(dict.fromkeys(tasks)))
         columns = {**clip.columns, **self._count(tasks, len(clip))}
+        if parts.subtasks and SUBTASK not in clip.columns and SUBTASK in table.column_names:
+            columns[SUBTASK] = self._number_subtasks(table, parts.subtasks)
         cuts = _cut_videos(clip, self._videos)
         origin = clip.source.root / clip.entry.file
         chunk, file = self._rows.write(table, columns, origin)
@@ -213,6 +219,15 @@ class _Writer:
             "task_index": np.array([self.meta.get_task_index(task) for task in tasks]),
         }
 
+    def _number_subtasks(self, table: pa.Table, names: Mapping[int, str]) -> np.ndarray:
+        """Number the sub-tasks of each row anew, the same everywhere in the new dataset."""
+        numbers = table[SUBTASK].to_pylist()
+        self._subtasks += [name for name in names.values() if name not in self._subtasks]
+        # A number without a name stays as it is; LeRobot's is -1.
+        return np.array(
+            [self._subtasks.index(names[n]) if n in names else n for n in numbers], np.int64
+        )
+
     def _find_stats(
         self,
         clip: Clip,
@@ -256,6 +271,7 @@ class _SourceParts:
         except Exception as error:  # whatever pandas makes of a malformed file
             raise BadDataset(root, f"meta/tasks.parquet is not readable ({error})") from error
         self._root = root
+        self.subtasks = read_subtasks(root)
 
     def name_tasks(self, table: pa.Table, clip: Clip) -> list[str]:
         """Name the task of each row."""

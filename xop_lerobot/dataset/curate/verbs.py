@@ -26,8 +26,9 @@ VERBS = {
     "trim": "trim",
     "merge": "merge",
     "split": "split",
-    "retarget": "retarget",
     "repair": "repair",
+    "label": "label",
+    "retarget": "retarget",
 }
 """Module of each verb, in the order of the list."""
 
