@@ -22,6 +22,8 @@ type Films = Mapping[str, np.ndarray]
 type Load = Callable[[int], Films]
 
 _PLAY_MS = 40
+_LEAST_WIDTH = 160
+"""Width of a picture that its label fits over [pixel]."""
 _STRIDE = {"left": -1, "right": 1, "down": -10, "up": 10}
 
 
@@ -54,7 +56,13 @@ def read_films(source: Source, entry: EpisodeEntry, number: int | None = None) -
             films[name] = list(read_pictures(source.read_table(entry)[key], list(wanted)))
     if not films or not all(films.values()):
         raise BadDataset(source.root, f"episode {entry.index} has no pictures to show")
-    return {name: np.stack(pictures) for name, pictures in films.items()}
+    return {name: _enlarge(np.stack(pictures)) for name, pictures in films.items()}
+
+
+def _enlarge(film: np.ndarray) -> np.ndarray:
+    """Repeat the pixels of small pictures, so that their labels fit. Shape (n, h, w, 3)."""
+    factor = -(-_LEAST_WIDTH // film.shape[2])
+    return film.repeat(factor, axis=1).repeat(factor, axis=2)
 
 
 def has_display() -> bool:
