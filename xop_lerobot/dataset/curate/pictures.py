@@ -40,6 +40,14 @@ class VideoIndex:
         """When each picture is shown [s]. Shape (n,)."""
         return self.pts * float(self.time_base)
 
+    def count_missing(self, start: float, length: int, fps: float) -> int:
+        """Count those of `length` frames from `start` [s] on at which no picture is shown."""
+        wanted = start + np.arange(length) / fps
+        times = np.concatenate([[-np.inf], np.sort(self.times), [np.inf]])
+        after = np.searchsorted(times, wanted)
+        near = np.minimum(wanted - times[after - 1], times[after] - wanted)
+        return int((near > 0.25 / fps).sum())
+
     def find_groups(self, start: float, stop: float, fps: float) -> tuple[int, int] | None:
         """Find the whole groups that hold what is shown from `start` to `stop` [s].
 
@@ -91,12 +99,30 @@ class Cut:
         file: The video, relative to it.
         start: Time of the first picture [s].
         stop: Time of the end of the last [s].
+        length: How many pictures should be in it; None where that is not known.
+        spare: How many of them may be missing, because the encoder dropped them.
     """
 
     root: Path
     file: Path
     start: float
     stop: float
+    length: int | None = None
+    spare: int = 0
+
+    def check(self, index: VideoIndex, fps: float) -> None:
+        """Check that all its pictures are there.
+
+        Raises:
+            BadDataset: If not.
+        """
+        missing = index.count_missing(self.start, self.length or 0, fps)
+        if missing > self.spare:
+            raise BadDataset(
+                self.root,
+                f"{self.file} lacks {missing} of the {self.length} pictures from "
+                f"{self.start:.3f} s on, at {fps:g} Hz. `xop-curate repair` keeps what is whole",
+            )
 
 
 class VideoFile:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ class RowFiles:
         self, root: Path, template: str, chunks_size: int, features: Mapping[str, Any]
     ) -> None:
         self._root, self._template, self._chunks_size = root, template, chunks_size
-        self._schema = get_hf_features_from_features(dict(features)).arrow_schema
+        self._schema = make_schema(features)
         self._writer: pq.ParquetWriter | None = None
         self._origin: object = None
         self.place = (0, -1)
@@ -52,21 +53,11 @@ class RowFiles:
         Raises:
             BadDataset: If a column is missing, or is not what the features say.
         """
-        arrays = []
-        for field in self._schema:
-            try:
-                if field.name in columns:
-                    arrays.append(to_arrow(columns[field.name], field.type))
-                else:
-                    arrays.append(cast_column(table[field.name], field.type))
-            except (pa.ArrowException, KeyError) as error:
-                raise BadDataset(
-                    origin, f"its column '{field.name}' is not {field.type} ({error})"
-                ) from error
+        rows = make_rows(table, columns, self._schema, origin)
         if self._writer is None or origin != self._origin:
             self._open(origin)
         assert self._writer is not None
-        self._writer.write_table(pa.Table.from_arrays(arrays, schema=self._schema))
+        self._writer.write_table(rows)
         return self.place
 
     def _open(self, origin: object) -> None:
@@ -85,6 +76,50 @@ class RowFiles:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
+
+
+def make_schema(features: Mapping[str, Any]) -> pa.Schema:
+    """Make the schema of data files, as LeRobot writes them."""
+    wanted = copy.deepcopy(dict(features))
+    for feature in wanted.values():
+        feature["shape"] = tuple(feature["shape"])
+    return get_hf_features_from_features(wanted).arrow_schema
+
+
+def make_rows(
+    table: pa.Table, columns: Mapping[str, np.ndarray], schema: pa.Schema, origin: object
+) -> pa.Table:
+    """Make rows as LeRobot writes them; arguments as in `RowFiles.write`.
+
+    Raises:
+        BadDataset: If a column is missing, is not what the features say, or has empty values.
+    """
+    arrays = []
+    for field in schema:
+        try:
+            if field.name in columns:
+                array = to_arrow(columns[field.name], field.type)
+            else:
+                array = cast_column(table[field.name], field.type)
+        except (pa.ArrowException, KeyError) as error:
+            text = str(error).splitlines()[0]
+            raise BadDataset(
+                origin, f"its column '{field.name}' is not {field.type} ({text})"
+            ) from error
+        if count_empty(array):
+            raise BadDataset(
+                origin, f"its column '{field.name}' has {count_empty(array)} empty values"
+            )
+        arrays.append(array)
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def count_empty(array: pa.Array) -> int:
+    """Count the empty values of a column, and those in its lists."""
+    inner = 0
+    if pa.types.is_fixed_size_list(array.type) and not array.null_count:
+        inner = array.flatten().null_count
+    return array.null_count + inner
 
 
 def next_place(place: tuple[int, int], chunks_size: int) -> tuple[int, int]:

@@ -291,11 +291,14 @@ class _SourceParts:
 def _cut_videos(clip: Clip, keys: Iterable[str]) -> dict[str, Cut]:
     """Find where the pictures of a clip are."""
     (start, stop), fps, cuts = clip.span, clip.source.fps, {}
+    dropped = clip.entry.facts.get("dropped_frames")
+    spare = dropped if isinstance(dropped, int) else 0
     for key in keys:
         span = clip.entry.videos[key]
         # The end of the last picture, as the metadata has it: pictures may have been dropped.
         end = span.stop if stop == clip.entry.length else span.start + stop / fps
-        cuts[key] = Cut(clip.source.root, span.file, span.start + start / fps, end)
+        begin = span.start + start / fps
+        cuts[key] = Cut(clip.source.root, span.file, begin, end, stop - start, spare)
     return cuts
 
 

@@ -50,6 +50,7 @@ class VideoFiles:
         if origin != self._origin or self._index is None:
             self._index, self._origin = index_video(cut.root, cut.file), origin
             self.close()
+        cut.check(self._index, self._fps)
         start, stop = cut.start, cut.stop
         if self._file is None:
             self._place = next_place(self._place, self._chunks_size)

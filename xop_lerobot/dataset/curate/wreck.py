@@ -8,7 +8,6 @@ still in memory is gone.
 
 from __future__ import annotations
 
-import copy
 import itertools
 import shutil
 from collections.abc import Iterator
@@ -21,7 +20,6 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import write_tasks
 
 from xop_lerobot.dataset.curate.entries import (
@@ -32,6 +30,7 @@ from xop_lerobot.dataset.curate.entries import (
     read_entries,
 )
 from xop_lerobot.dataset.curate.pictures import VideoIndex, index_video
+from xop_lerobot.dataset.curate.row_files import make_rows, make_schema
 from xop_lerobot.dataset.curate.salvage import CannotSalvage, salvage
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.facts import FACTS_DIR
@@ -89,10 +88,7 @@ def _lay_out_rows(
     wreck: Wreck, features: dict[str, Any], folder: Path
 ) -> Iterator[tuple[int, tuple[Path, pa.Table]]]:
     """Make every data file readable, and yield file and counters of each episode by its index."""
-    wanted = copy.deepcopy(features)
-    for feature in wanted.values():
-        feature["shape"] = tuple(feature["shape"])
-    schema = get_hf_features_from_features(wanted).arrow_schema
+    schema = make_schema(features)
     for path in sorted((wreck.root / "data").glob("*/*.parquet")):
         name = path.relative_to(wreck.root)
         target = folder / name
@@ -109,13 +105,21 @@ def _lay_out_rows(
                 target.unlink(missing_ok=True)
                 continue
             wreck.notes.append(f"{name} was cut off: {count} episodes' rows in it are whole")
+        except CannotSalvage as fault:
+            wreck.notes.append(f"{name} is not usable ({fault}): left out")
+            continue
         for index in pc.unique(table["episode_index"]).to_pylist():
             yield index, (name, table.filter(pc.equal(table["episode_index"], index)))
 
 
 def _read_counters(path: Path) -> pa.Table:
     with pq.ParquetFile(path) as file:
-        return file.read(columns=list(_COUNTERS), use_threads=False)
+        names = file.schema_arrow.names
+        missing = [name for name in _COUNTERS if name not in names]
+        if missing:
+            raise CannotSalvage(f"it has no column {', '.join(missing)}")
+        table = file.read(columns=list(_COUNTERS), use_threads=False)
+    return table.cast(pa.schema([(name, pa.int64()) for name in table.column_names]))
 
 
 def _read_known(wreck: Wreck, info: dict[str, Any], folder: Path) -> dict[int, EpisodeEntry]:
@@ -180,7 +184,7 @@ def _find_whole(
     tasks: dict[int, str],
 ) -> None:
     source, facts = wreck.source, FactsFile(wreck.root)
-    videos = Videos(wreck, known)
+    videos, schema = Videos(wreck, known), make_schema(source.features)
     for index in sorted(rows.keys() | known.keys()):
         entry = known.get(index)
         if index not in rows:
@@ -211,16 +215,16 @@ def _find_whole(
                 continue
         else:
             entry = EpisodeEntry(index, length, entry.tasks, entry.facts, file, entry.videos)
-        fault = videos.check(entry) or _check_rows(source, entry)
+        fault = videos.check(entry) or _check_rows(source, entry, schema)
         if fault:
             wreck.lost[index] = fault
         else:
             wreck.entries.append(entry)
 
 
-def _check_rows(source: Source, entry: EpisodeEntry) -> str:
+def _check_rows(source: Source, entry: EpisodeEntry, schema: pa.Schema) -> str:
     try:
-        source.read_table(entry)
+        make_rows(source.read_table(entry), {}, schema, entry.file)
     except BadDataset as error:
         return error.fault
     return ""
@@ -300,10 +304,9 @@ class Videos:
             index = self._index(span.file)
             if index is None:
                 return f"its pictures of '{key}' are not readable"
-            half = 0.5 / self._fps
-            shown = (index.times > span.start - half) & (index.times < span.stop - half)
-            missing = entry.length - int(shown.sum()) - int(entry.facts.get("dropped_frames") or 0)
-            if missing > 0:
+            dropped = entry.facts.get("dropped_frames")
+            missing = index.count_missing(span.start, entry.length, self._fps)
+            if missing > (dropped if isinstance(dropped, int) else 0):
                 return f"{missing} of its {entry.length} pictures of '{key}' are gone"
         return ""
 
