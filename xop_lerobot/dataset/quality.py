@@ -224,7 +224,8 @@ def find_still(
     rows = np.ascontiguousarray(points.T)
     high = maximum_filter1d(rows, size, axis=1, mode="nearest")
     low = minimum_filter1d(rows, size, axis=1, mode="nearest")
-    return (high - low <= limit).all(axis=0)
+    with np.errstate(invalid="ignore"):  # what is not finite does not stand still
+        return (high - low <= limit).all(axis=0)
 
 
 def make_points(pose: np.ndarray) -> np.ndarray:
@@ -233,7 +234,8 @@ def make_points(pose: np.ndarray) -> np.ndarray:
     Shape (n, 7) -> (n, 9) [m].
     """
     origin, quat = pose[:, :3], pose[:, 3:]
-    ends = [origin + quat_rotate(quat, LEVER_M * axis) for axis in np.eye(3)[:2]]
+    with np.errstate(invalid="ignore"):
+        ends = [origin + quat_rotate(quat, LEVER_M * axis) for axis in np.eye(3)[:2]]
     return np.concatenate([origin, *ends], axis=1)
 
 

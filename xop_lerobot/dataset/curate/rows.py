@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from xop_lerobot.dataset.curate.column_check import find_faults
 from xop_lerobot.dataset.curate.entries import EpisodeEntry
 from xop_lerobot.errors import BadDataset
 
@@ -33,6 +34,7 @@ class RowReader:
         self._path = Path()
         self._file: pq.ParquetFile | None = None
         self._groups: list[tuple[int, int] | None] = []
+        self._faults: tuple[str, ...] = ()
         self._cached: tuple[object, pa.Table] | None = None
 
     def close(self) -> None:
@@ -55,6 +57,19 @@ class RowReader:
         table = self.read_table(entry, names)
         return {name: self._convert(entry, name, table[name]) for name in names}
 
+    def check(self, entry: EpisodeEntry) -> None:
+        """Check that all columns of an episode's file are as announced, without reading them.
+
+        Raises:
+            BadDataset: If the file is not readable, or one is not.
+        """
+        try:
+            self._open(entry.file)
+        except (pa.ArrowException, OSError) as error:
+            raise self._make_unreadable(entry, error) from error
+        if self._faults:
+            raise BadDataset(self._root, f"{entry.file} {'; it '.join(self._faults)}")
+
     def read_table(self, entry: EpisodeEntry, names: Sequence[str] = ()) -> pa.Table:
         """Read columns of an episode as its file has them; all of its features without `names`.
 
@@ -63,13 +78,12 @@ class RowReader:
                 whole episode.
         """
         if not names:
+            self.check(entry)
             names = [key for key, each in self._features.items() if each["dtype"] != "video"]
         try:
             table = self._read_table(entry, tuple(names))
         except (pa.ArrowException, OSError) as error:
-            self.close()
-            text = str(error).splitlines()[0]
-            raise BadDataset(self._root, f"{entry.file} is not readable ({text})") from error
+            raise self._make_unreadable(entry, error) from error
         if table.num_rows != entry.length:
             raise BadDataset(
                 self._root,
@@ -77,6 +91,11 @@ class RowReader:
                 f"it has {table.num_rows}",
             )
         return table
+
+    def _make_unreadable(self, entry: EpisodeEntry, error: Exception) -> BadDataset:
+        self.close()
+        text = (str(error) or type(error).__name__).splitlines()[0]
+        return BadDataset(self._root, f"{entry.file} is not readable ({text})")
 
     def _read_table(self, entry: EpisodeEntry, names: Sequence[str]) -> pa.Table:
         file = self._open(entry.file)
@@ -98,6 +117,7 @@ class RowReader:
             self.close()
             self._file, self._path = pq.ParquetFile(self._root / path), path
             self._groups = _find_groups(self._file)
+            self._faults = tuple(find_faults(self._file, self._features))
         return self._file
 
     def _read_group(self, file: pq.ParquetFile, group: int, names: Sequence[str]) -> pa.Table:
@@ -110,18 +130,21 @@ class RowReader:
 
     def _convert(self, entry: EpisodeEntry, name: str, column: pa.ChunkedArray) -> np.ndarray:
         feature = self._features[name]
-        shape = tuple(feature["shape"])
-        size = int(np.prod(shape))
-        values: Any = column.combine_chunks()
-        if isinstance(values, pa.ChunkedArray):  # none or several chunks, by version
-            values = pa.concat_arrays(values.chunks) if values.num_chunks else pa.array([])
-        rows = len(values)
+        size = int(np.prod(feature["shape"]))
         where = f"column '{name}' of episode {entry.index}"
-        while pa.types.is_nested(values.type) and hasattr(values, "flatten"):
-            if pa.types.is_struct(values.type):
-                raise BadDataset(self._root, f"{where} holds pictures and no numbers")
-            if values.null_count:
-                break
+        if _holds_pictures(column.type):
+            raise BadDataset(self._root, f"{where} holds pictures and no numbers")
+        values, rows = column.combine_chunks(), len(column)
+        if isinstance(values, pa.ChunkedArray):  # as some versions of pyarrow have it
+            values = pa.concat_arrays(values.chunks) if values.num_chunks else pa.array([])
+        while pa.types.is_nested(values.type) and not values.null_count:
+            sizes = pc.unique(pc.list_value_length(values)).to_pylist()
+            if len(sizes) > 1:
+                raise BadDataset(
+                    self._root,
+                    f"{where} must have {size} entries in each row, it has {min(sizes)} to "
+                    f"{max(sizes)}",
+                )
             values = values.flatten()
         if values.null_count:
             raise BadDataset(self._root, f"{where} has {values.null_count} empty values")
@@ -135,6 +158,14 @@ class RowReader:
                 self._root, f"{where} must hold {feature['dtype']}, it holds {values.type}"
             )
         return array.reshape(rows, size)
+
+
+def _holds_pictures(kind: pa.DataType) -> bool:
+    while pa.types.is_nested(kind):
+        if pa.types.is_struct(kind):
+            return True
+        kind = kind.value_type
+    return False
 
 
 def _find_groups(file: pq.ParquetFile) -> list[tuple[int, int] | None]:

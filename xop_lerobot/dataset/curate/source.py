@@ -116,6 +116,14 @@ class Source:
         """
         return self._rows.read_table(entry)
 
+    def check_rows(self, entry: EpisodeEntry) -> None:
+        """Check that the columns of an episode's file are as announced, without reading them.
+
+        Raises:
+            BadDataset: If the file is not readable, or one is not.
+        """
+        self._rows.check(entry)
+
     def check(self, columns: Iterable[str]) -> None:
         """Check that the dataset has these columns.
 

@@ -101,10 +101,14 @@ def _measure(
     columns = {each: each.find_columns(source.features, entry) for each in measures}
     able = {each: names for each, names in columns.items() if names is not None}
     together = tuple(dict.fromkeys(name for names in able.values() for name in names))
-    if read_all and not together:
-        # Whether the rows are there at all is to be found out.
+    if read_all and not together:  # whether the rows are there is to be found out
         together = ("frame_index",) if "frame_index" in source.features else ()
     rows: Mapping[str, np.ndarray] | None = None
+    try:
+        if read_all:
+            source.check_rows(entry)
+    except BadDataset as error:
+        problems.append(error.fault)
     try:
         rows = source.read(entry, together) if together else {}
     except BadDataset as error:
