@@ -90,6 +90,18 @@ def check_control(flags: list[str]) -> None:
         apply_change(robot, make_settings(robot, RetargeterConfig()), parse_change(request))
 
 
+def check_curate(words: list[str]) -> None:
+    """Check that a verb takes the flags, and that expressions are ones."""
+    from xop_lerobot.dataset.curate.cli import make_verb_parser
+    from xop_lerobot.dataset.curate.expression import Expression
+    from xop_lerobot.dataset.curate.figures import KINDS
+    from xop_lerobot.dataset.curate.verbs import load_verb
+
+    parsed = make_verb_parser(words[0], load_verb(words[0])).parse(words[1:])
+    if hasattr(parsed, "where"):
+        Expression(parsed.where, KINDS)
+
+
 @pytest.mark.parametrize(("page", "command"), ALL_COMMANDS)
 def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     if command[0] == "make":
@@ -114,6 +126,9 @@ def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.Monk
         monkeypatch.chdir(ROOT)
         monkeypatch.setattr(study, "_find_absence", lambda *_: "")
         assert make_study(parse_arguments(command[1:]))
+        return
+    if command[0] == "xop-curate":
+        check_curate(command[1:])
         return
     config = parse(command, monkeypatch)
     dataset = getattr(config, "dataset", None)
