@@ -295,6 +295,13 @@ def _cut_videos(clip: Clip, keys: Iterable[str]) -> dict[str, Cut]:
     spare = dropped if isinstance(dropped, int) else 0
     for key in keys:
         span = clip.entry.videos[key]
+        pictures = (span.stop - span.start) * fps
+        if not -0.5 - spare < pictures - clip.entry.length < 0.5:  # half a picture for rounding
+            raise BadDataset(
+                clip.source.root,
+                f"episode {clip.entry.index} has {clip.entry.length} frames, but {pictures:g} "
+                f"pictures of '{key}'",
+            )
         # The end of the last picture, as the metadata has it: pictures may have been dropped.
         end = span.stop if stop == clip.entry.length else span.start + stop / fps
         begin = span.start + start / fps
