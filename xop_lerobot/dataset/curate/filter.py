@@ -18,6 +18,8 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from tqdm import tqdm
+
 from xop_lerobot.command_line import CommandParser
 from xop_lerobot.dataset.curate.arguments import (
     add_destination,
@@ -125,7 +127,7 @@ class Filter:
         total = self.source.total_episodes
         for finding in show_progress(findings, total, "episode", quiet=quiet):
             for problem in finding.problems:
-                print(f"problem: {problem}", file=sys.stderr)
+                tqdm.write(f"problem: {problem}", file=sys.stderr)
             result = self._expression.evaluate(finding.figures)
             if self._note(finding.entry, result, finding.figures):
                 yield finding.entry

@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from tqdm import tqdm
+
 from xop_lerobot.command_line import CommandParser
 from xop_lerobot.dataset.curate.arguments import add_source, show_progress
 from xop_lerobot.dataset.curate.expression import UnknownFigure
@@ -54,7 +56,7 @@ def add_arguments(parser: CommandParser) -> None:
         "--show",
         default=",".join(SHOWN),
         metavar="A,B,…",
-        help="figures that are the columns of the table (default: %(default)s)",
+        help=f"figures that are the columns of the table (default: {', '.join(SHOWN)})",
     )
     parser.epilog = f"figures:\n{describe_figures()}"
 
@@ -72,13 +74,15 @@ def run(arguments: argparse.Namespace) -> int:
             print(table.head)
         findings = survey(source, note=faults.append)
         total = source.total_episodes
-        for finding in show_progress(findings, total, "episode", quiet=arguments.quiet):
+        # On a terminal the table itself shows how far it is.
+        quiet = arguments.quiet or (sys.stdout.isatty() and not to_output)
+        for finding in show_progress(findings, total, "episode", quiet=quiet):
             write(finding.to_json())
             totals.add(finding.figures, bool(finding.problems))
             if not to_output:
                 print(table.format(finding.figures))
             for problem in finding.problems:
-                print(f"problem: {problem}", file=sys.stderr)
+                tqdm.write(f"problem: {problem}", file=sys.stderr)
         if not faults and totals.episodes != total:
             faults.append(f"meta/info.json counts {total} episodes, there are {totals.episodes}")
     for fault in faults:
