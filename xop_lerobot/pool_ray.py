@@ -10,7 +10,9 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 from collections.abc import Generator, Iterable, Sequence
+from textwrap import shorten
 from typing import Any
 
 from xop_lerobot.dataset.facts import read_versions
@@ -28,6 +30,9 @@ from xop_lerobot.pool import (
 
 LOCAL = "local"
 """Address that starts a cluster of this machine alone, for as long as the jobs take."""
+
+_LONGEST = 250
+"""Letters of what Ray says of a death that are told."""
 
 
 class RayUnavailable(XopError):
@@ -80,8 +85,8 @@ def _import_ray() -> Any:
         import ray  # noqa: PLC0415 optional
     except ImportError as error:
         raise RayUnavailable(
-            f"--ray needs Ray, which is not installed here ({error}). Install it: pip install "
-            "'ray[default]>=2.40,<3' or this project's extra 'ray'"
+            f"--ray needs Ray, which is not installed here ({error}). Install this project's extra "
+            "'ray', or: pip install 'ray>=2.40,<3'"
         ) from error
     return ray
 
@@ -163,9 +168,12 @@ class _Actor(Worker):
                 _check_versions(*self._ray.get(self._machine))
                 self._machine = None
             return self._ray.get(self.answer)
-        except (errors.RayActorError, errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
-            lines = str(error).strip().splitlines()
-            raise WorkerDied(f"the Ray worker died ({lines[0] if lines else error!r})") from error
+        except errors.RayError as error:
+            # The first line says what became of it, and the last why, if anybody knows.
+            text = re.sub(r"\x1b\[[\d;]*m", "", str(error))  # without colours
+            lines = [line.strip() for line in text.splitlines() if line.strip()]
+            why = " ".join(dict.fromkeys(lines[:1] + lines[-1:])) or repr(error)
+            raise WorkerDied(f"the Ray worker died ({shorten(why, _LONGEST)})") from error
 
     def stop(self) -> None:
         self._ray.kill(self._hand)

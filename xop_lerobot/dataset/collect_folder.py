@@ -226,7 +226,13 @@ class CollectFolder:
         return folder
 
     def close_attempt(self, folder: Path, attempt: Attempt) -> None:
-        """Let an episode count: from now on no kill can lose it."""
+        """Let an episode count: from now on no kill can lose it.
+
+        One without a single frame does not, and its directory goes.
+        """
+        if not attempt.frames:
+            shutil.rmtree(folder)
+            return
         write_whole(folder / "attempt.json", dataclasses.asdict(attempt))
         sync_tree(folder)
         os.rename(folder, self._find(attempt.index))

@@ -23,7 +23,7 @@ class Collection:
     """What there is in the end.
 
     Attributes:
-        attempts: Episodes of the dataset, or all that were asked for where there is none.
+        attempts: Episodes of the dataset and all that were asked for.
         wall_s: Time that all runs took, each killed one until its last finished episode [s].
     """
 
@@ -87,7 +87,8 @@ def run_collection(
             merge_attempts(folder, indices, repo_id, settings, note_walls)
             merged, walls = folder.read_dataset(), note_walls()
         counted = [Attempt(**row) for row in merged.get("attempts", ())]
-        counted = counted or [done[index] for index in indices]
+        held = {attempt.index for attempt in counted}
+        counted += [done[index] for index in indices if index not in held]
     return Collection(tuple(counted), sum(walls.values()))
 
 

@@ -61,7 +61,13 @@ class RetargetConfig(CollectConfig):
         if self.task:
             self.make_task()
         self.make_robot_config()
-        make_settings(self.morphology, self.make_teleop_config().retargeter)
+        retargeter = self.make_teleop_config().retargeter
+        make_settings(self.morphology, retargeter)
+        if self.weights and retargeter.type != "mpc":
+            raise BadValue(
+                f"weights are those of the planner, and a retargeter '{retargeter.type}' has none. "
+                "Use --method=mpc, or leave --weights out"
+            )
 
     def make_teleop_config(self) -> XopConfig:
         """Make the configuration of the teleoperator; see `CollectConfig.make_teleop_config`."""

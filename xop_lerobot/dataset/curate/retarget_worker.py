@@ -58,6 +58,8 @@ DEVICES.add(DEVICE, RetargetDevice)
 class Retargeter(Collector):
     """Replays single operators, in any order.
 
+    One that cannot be replayed makes an attempt without frames, which is tried again each time.
+
     Args:
         config: What they are replayed with.
         run: When this run began [s since the epoch].
@@ -66,7 +68,7 @@ class Retargeter(Collector):
     config: RetargetConfig
 
     def make(self, job: RetargetJob, folder: Path) -> Attempt:
-        """Replay an operator; one that cannot be replayed makes an attempt that is not kept."""
+        """Replay an operator."""
         if job.recording is None:
             return self._leave_out(job, job.fault)
         _OPERATORS.clear()
