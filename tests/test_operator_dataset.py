@@ -10,7 +10,12 @@ import pytest
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadRecording
-from xop_lerobot.operator.dataset_recording import load_dataset_recording, make_dataset_recording
+from xop_lerobot.operator.dataset_recording import (
+    COLUMNS,
+    choose_columns,
+    load_dataset_recording,
+    make_dataset_recording,
+)
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 
 FPS = 25
@@ -149,6 +154,12 @@ def test_faults_are_named(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "set")
     with pytest.raises(BadRecording, match=r"it has no episode 7 \(it has 2 episodes\)"):
         load_dataset_recording(root, 7)
+    odd = {"operator.head": {"dtype": "float32", "shape": [3]}}
+    features = {name: {"dtype": "float32", "shape": [size]} for name, size in COLUMNS.items()}
+    with pytest.raises(BadRecording, match=r"head must hold 7 numbers a row, it holds float32 of"):
+        choose_columns("x", features | odd)
+    text = {"operator.engaged": {"dtype": "string", "shape": [1]}}
+    assert choose_columns("x", features | text) == list(COLUMNS)
     stock = write_dataset(tmp_path / "stock", without="operator.pinch")
     with pytest.raises(BadRecording, match=r"the dataset has no column operator\.pinch\. Its"):
         load_dataset_recording(stock)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,8 @@ from xop_lerobot.state import FRAMES
 from xop_lerobot.transforms import IDENTITY_POSE
 
 POSE_COLUMNS = tuple(f"operator.{frame}" for frame in FRAMES)
-COLUMNS = (*POSE_COLUMNS, "operator.pinch", "operator.tracked")
+COLUMNS = {**dict.fromkeys(POSE_COLUMNS, 7), "operator.pinch": 2, "operator.tracked": 3}
+"""Columns that are needed, and the numbers that they hold in a row."""
 ENGAGED_COLUMN = "operator.engaged"
 CLOCKS = {"time.sim": 1.0, "time.wall": 1e-9, "timestamp": 1.0}
 """Columns that tell the time, best first, and the seconds that one of their units is. Of a robot
@@ -70,7 +71,7 @@ def choose_columns(root: object, features: Mapping[str, Any]) -> list[str]:
         features: Its features.
 
     Raises:
-        BadRecording: If it lacks one that is needed.
+        BadRecording: If it lacks one that is needed, or holds something else in it.
     """
     missing = [column for column in COLUMNS if column not in features]
     if missing:
@@ -79,7 +80,21 @@ def choose_columns(root: object, features: Mapping[str, Any]) -> list[str]:
             f"the dataset has no column {', '.join(missing)}. Its columns: "
             f"{', '.join(sorted(features))}",
         )
-    return [*COLUMNS, *(column for column in OPTIONAL_COLUMNS if column in features)]
+    for column, size in COLUMNS.items():
+        feature = features[column]
+        shape = list(feature.get("shape") or ())
+        if shape != [size] or not _holds_numbers(feature):
+            raise BadRecording(
+                root,
+                f"column {column} must hold {size} numbers a row, it holds "
+                f"{feature.get('dtype')} of shape {shape}",
+            )
+    able = (column for column in OPTIONAL_COLUMNS if column in features)
+    return [*COLUMNS, *(column for column in able if _holds_numbers(features[column]))]
+
+
+def _holds_numbers(feature: Mapping[str, Any]) -> bool:
+    return str(feature.get("dtype")).startswith(("float", "int", "uint", "bool"))
 
 
 def make_dataset_recording(
@@ -127,9 +142,11 @@ def make_dataset_recording(
         # Columns hold zeros where the device gave nothing; the flag says so.
         unknown = ~tracked[:, limb] & ~_is_pose(poses)
         arrays[f"{frame}_pose"] = np.where(unknown[:, None], IDENTITY_POSE, poses)
-    names: Sequence[str] = (features.get("action") or {}).get("names") or ()
-    if "action" in columns and MODE_KEY in names:
-        arrays["mode"] = np.round(columns["action"][rows, list(names).index(MODE_KEY)])
+    names = (features.get("action") or {}).get("names")
+    if "action" in columns and isinstance(names, list) and MODE_KEY in names:
+        place = names.index(MODE_KEY)
+        if place < columns["action"].shape[1]:
+            arrays["mode"] = np.round(columns["action"][rows, place])
     recording = make_recording(arrays, source)
     return dataclasses.replace(recording, engaged=engaged[rows]), rows
 

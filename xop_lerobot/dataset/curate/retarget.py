@@ -147,6 +147,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Retarget a dataset; returns the exit code."""
     if arguments.out is None and not arguments.dry_run:
         raise BadValue("say where the new dataset goes: --out=DIR, or --dry-run")
+    if arguments.json is not None and not arguments.json.resolve().parent.is_dir():
+        raise BadValue(f"--json: there is no directory '{arguments.json.parent}'")
     if arguments.workers < 0:
         raise BadValue(f"--workers must be at least 0, got {arguments.workers}")
     with Source(arguments.root) as source:
