@@ -129,7 +129,10 @@ def edit_feature(key: str, **changes: Any) -> Callable[[Path], None]:
 
 
 def write(name: str, content: bytes) -> Callable[[Path], None]:
-    return lambda root: (root / name).write_bytes(content) and None
+    def change(root: Path) -> None:
+        (root / name).write_bytes(content)
+
+    return change
 
 
 def cut(name: str, share: float = 0.5) -> Callable[[Path], None]:

@@ -58,12 +58,12 @@ class GapFigures(NamedTuple):
     """For how long the device did not see the operator.
 
     Attributes:
-        count: Number of gaps.
+        number: Number of gaps.
         total: Their time [s].
         longest: Time of the longest [s].
     """
 
-    count: int
+    number: int
     total: float
     longest: float
 
@@ -176,7 +176,7 @@ def find_gaps(tracked: np.ndarray, engaged: np.ndarray) -> np.ndarray:
     """
     if not engaged.any():
         return np.zeros(len(engaged), bool)
-    gaps = ~np.asarray(tracked, bool).all(axis=1)
+    gaps = np.asarray(~np.asarray(tracked, bool).all(axis=1))
     gaps[: int(np.argmax(engaged))] = False
     return gaps
 
@@ -225,7 +225,7 @@ def find_still(
     high = maximum_filter1d(rows, size, axis=1, mode="nearest")
     low = minimum_filter1d(rows, size, axis=1, mode="nearest")
     with np.errstate(invalid="ignore"):  # what is not finite does not stand still
-        return (high - low <= limit).all(axis=0)
+        return np.asarray((high - low <= limit).all(axis=0))
 
 
 def make_points(pose: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from xop_lerobot.errors import BadDataset
 
 EPISODES_DIR = Path("meta") / "episodes"
 _REQUIRED = ("episode_index", "length", "data/chunk_index", "data/file_index")
+_TIMES = ("from_timestamp", "to_timestamp")
 _JSON_FACTS = ("versions", "settings", "changes", "provenance")
 _BATCH = 64
 """Episodes whose metadata is in memory at a time."""
@@ -199,18 +201,24 @@ def _find_videos(
         if feature["dtype"] != "video":
             continue
         prefix = f"videos/{key}/"
-        places = {
-            name: row.get(prefix + name)
-            for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
-        }
+        places = {name: row.get(prefix + name) for name in ("chunk_index", "file_index", *_TIMES)}
         if any(place is None for place in places.values()):
             raise BadDataset(
                 root, f"episode {row['episode_index']} does not say where its video '{key}' is"
             )
-        start, stop = places.pop("from_timestamp"), places.pop("to_timestamp")
-        template = info.get("video_path")
-        file = _find_file(root, template, video_key=key, **places)
-        yield key, VideoSpan(file, float(start), float(stop))
+        start, stop = (_to_seconds(root, row, prefix + name) for name in _TIMES)
+        chunk, number = places["chunk_index"], places["file_index"]
+        file = _find_file(
+            root, info.get("video_path"), video_key=key, chunk_index=chunk, file_index=number
+        )
+        yield key, VideoSpan(file, start, stop)
+
+
+def _to_seconds(root: Path, row: Mapping[str, Any], name: str) -> float:
+    value = row[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise BadDataset(root, f"{EPISODES_DIR} must give '{name}' as a time [s], got {value!r}")
+    return float(value)
 
 
 def _find_file(root: Path, template: object, **places: Any) -> Path:

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -139,7 +139,7 @@ class Filter:
             self.failed = True
             raise
 
-    def _note(self, entry: EpisodeEntry, result: bool | None, figures: dict) -> bool:
+    def _note(self, entry: EpisodeEntry, result: bool | None, figures: Mapping[str, Any]) -> bool:
         seconds = entry.length / self.source.fps
         self._seconds += seconds
         if result is None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from xop_lerobot.dataset.curate.column_check import find_faults
@@ -109,7 +108,7 @@ class RowReader:
         for group, span in enumerate(self._groups):
             if span is None or span[0] <= entry.index <= span[1]:
                 table = self._read_group(file, group, names)
-                parts.append(table.filter(pc.equal(table[INDEX], entry.index)))
+                parts.append(table.filter(pa.array(table[INDEX].to_numpy() == entry.index)))
         return pa.concat_tables(parts) if parts else pa.table({name: [] for name in names})
 
     def _open(self, path: Path) -> pq.ParquetFile:
@@ -138,7 +137,7 @@ class RowReader:
         if isinstance(values, pa.ChunkedArray):  # as some versions of pyarrow have it
             values = pa.concat_arrays(values.chunks) if values.num_chunks else pa.array([])
         while pa.types.is_nested(values.type) and not values.null_count:
-            sizes = pc.unique(pc.list_value_length(values)).to_pylist()
+            sizes = values.value_lengths().unique().to_pylist()
             if len(sizes) > 1:
                 raise BadDataset(
                     self._root,
@@ -170,13 +169,16 @@ def _holds_pictures(kind: pa.DataType) -> bool:
 
 def _find_groups(file: pq.ParquetFile) -> list[tuple[int, int] | None]:
     """Find the lowest and the highest episode of each row group; None where it is not stated."""
-    metadata, spans = file.metadata, []
+    metadata = file.metadata
+    spans: list[tuple[int, int] | None] = []
     names = file.schema_arrow.names
     for group in range(metadata.num_row_groups):
         column = metadata.row_group(group)
         places = {column.column(i).path_in_schema: i for i in range(column.num_columns)}
         place = places.get(INDEX) if INDEX in names else None
         statistics = None if place is None else column.column(place).statistics
-        known = statistics is not None and statistics.has_min_max
-        spans.append((int(statistics.min), int(statistics.max)) if known else None)
+        if statistics is None or not statistics.has_min_max:
+            spans.append(None)
+        else:
+            spans.append((int(statistics.min), int(statistics.max)))
     return spans

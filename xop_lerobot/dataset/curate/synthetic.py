@@ -62,7 +62,7 @@ def make_dataset(
     config = {"robot": {"type": name}, "synthetic": {"seed": seed, "frames": frames}}
     write_config(root, config)
     pattern = _make_pattern(features, frames, fps, seed)
-    stats = compute_episode_stats(pattern, features)
+    stats = compute_episode_stats({**pattern}, features)
     schema = get_hf_features_from_features(meta.features).arrow_schema
     meta.save_episode_tasks([TASK])
     for index in range(episodes):

@@ -6,6 +6,7 @@ import struct
 from pathlib import Path
 
 import av
+from av.error import FFmpegError
 
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 
@@ -57,15 +58,20 @@ def _probe(path: Path) -> tuple[str, float]:
     try:
         if _is_cut_off(path):
             return "it is cut off", 0.0
+        end = None
         with av.open(str(path)) as container:
-            if not container.streams.video:
-                return "it has no video", 0.0
-            stream = container.streams.video[0]
-            if stream.duration and stream.time_base:
-                return "", float((stream.duration + (stream.start_time or 0)) * stream.time_base)
-            return "", stream.frames / float(stream.average_rate or 1)
-    except (av.FFmpegError, OSError, ValueError) as error:
+            if container.streams.video:
+                end = _find_end(container.streams.video[0])
+        return ("it has no video", 0.0) if end is None else ("", end)
+    except (FFmpegError, OSError, ValueError) as error:
         return getattr(error, "strerror", None) or str(error), 0.0
+
+
+def _find_end(stream: av.VideoStream) -> float:
+    """Find when the last picture of a stream ends [s]."""
+    if stream.duration and stream.time_base:
+        return float((stream.duration + (stream.start_time or 0)) * stream.time_base)
+    return stream.frames / float(stream.average_rate or 1)
 
 
 def _is_cut_off(path: Path) -> bool:
