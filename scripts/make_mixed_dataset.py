@@ -16,16 +16,15 @@ that 30 episodes take about a minute. The same seed makes the same episodes.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import logging
+import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -55,6 +54,13 @@ when the person engages."""
 KILLED_EPISODES = 3
 """Episodes that a killed session had saved."""
 SESSION = "mixed"
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
+    # A process that is killed cleans nothing up, and is meant not to.
+    "PYTHONWARNINGS": "ignore:resource_tracker",
+}
 
 
 @dataclass(frozen=True)
@@ -255,12 +261,15 @@ class Recorder:
         self.robot.disconnect()
 
 
-@contextlib.contextmanager
-def open_recorder(root: Path, seed: int, size: tuple[int, int]) -> Iterator[Recorder]:
-    """Open a recorder and close it again."""
+def make_session(root: Path, seed: int, size: tuple[int, int], kinds: Sequence[str]) -> None:
+    """Record a session with an episode of each of `kinds`."""
     recorder = Recorder(root, seed, size)
     try:
-        yield recorder
+        for index, kind in enumerate(tqdm(kinds, desc="episodes", disable=None)):
+            recorder.record(index, kind)
+    except BaseException:
+        shutil.rmtree(root, ignore_errors=True)
+        raise
     finally:
         recorder.close()
 
@@ -322,57 +331,60 @@ def main() -> int:
     parser.add_argument("--width", type=int, default=48, help="of a picture [pixel]")
     parser.add_argument("--height", type=int, default=36, help="of a picture [pixel]")
     parser.add_argument("--only-session", action="store_true", help="leave the killed ones out")
-    parser.add_argument("--die", choices=("xop", "stock"), help=argparse.SUPPRESS)
     args = parser.parse_args()
-    _calm_down()
-    size, session = (args.width, args.height), args.out / "session"
     try:
-        if args.die == "xop":
-            make_killed(args.out / "killed", args.seed + 1, size)
-        elif args.die == "stock":
-            make_killed_stock(session, args.out / "killed_stock")
-        make_all(args, session, size)
+        make_all(args)
     except XopError as error:
         sys.exit(f"error: {error}")
     return 0
 
 
-def _calm_down() -> None:
-    """Leave out what encoders tell of themselves."""
-    import av.logging
-
-    av.logging.set_libav_level(av.logging.ERROR)
-    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-
-
-def make_all(args: argparse.Namespace, session: Path, size: tuple[int, int]) -> None:
+def make_all(args: argparse.Namespace) -> None:
     """Make the whole session, then let two more be killed.
 
     Raises:
         BadValue: If there are too few episodes, or the directory holds something.
+        XopError: If a session ends in another way than it should.
     """
     least = KILLED_EPISODES + 1
     if args.episodes < least:
         raise BadValue(f"--episodes must be at least {least}, got {args.episodes}")
     if args.out.exists() and any(args.out.iterdir()):
         raise BadValue(f"'{args.out}' is not empty. Choose another --out, or delete it")
+    args.out.mkdir(parents=True, exist_ok=True)
+    session, size = args.out / "session", (args.width, args.height)
     kinds = [ORDER[index % len(ORDER)] for index in range(args.episodes)]
-    try:
-        with open_recorder(session, args.seed, size) as recorder:
-            for index, kind in enumerate(tqdm(kinds, desc="episodes", disable=None)):
-                recorder.record(index, kind)
-    except BaseException:
-        shutil.rmtree(session, ignore_errors=True)
-        raise
+    run(make_session, session, args.seed, size, kinds)
     (args.out / "kinds.json").write_text(json.dumps(kinds) + "\n", encoding="utf-8")
-    if args.only_session:
-        return
-    for how in ("xop", "stock"):
-        command = [sys.executable, __file__, "--die", how]
-        command += [f"--{key}={getattr(args, key)}" for key in ("out", "seed", "width", "height")]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != -signal.SIGKILL:
-            raise XopError(f"the session '{how}' was not killed but failed:\n{done.stderr[-2000:]}")
+    if not args.only_session:
+        run(make_killed, args.out / "killed", args.seed + 1, size, expected=-signal.SIGKILL)
+        run(make_killed_stock, session, args.out / "killed_stock", expected=-signal.SIGKILL)
+
+
+def run(target: Callable[..., None], *arguments: Any, expected: int = 0) -> None:
+    """Run `target` in a process of its own, which has imported what is slow to import.
+
+    Raises:
+        XopError: If it does not end with the exit code `expected`.
+    """
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["lerobot.datasets", "lerobot_robot_xop.xop_robot"])
+    process = context.Process(target=_run_calmly, args=(target, *arguments))
+    process.start()
+    process.join()
+    if process.exitcode != expected:
+        raise XopError(f"'{target.__name__}' ended with exit code {process.exitcode}")
+
+
+def _run_calmly(target: Callable[..., None], *arguments: Any) -> None:
+    """Run `target` without what encoders and decoders tell of themselves."""
+    import av.logging
+
+    av.logging.set_libav_level(av.logging.ERROR)
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    target(*arguments)
 
 
 if __name__ == "__main__":
