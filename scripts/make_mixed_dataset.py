@@ -59,7 +59,7 @@ ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
     # A process that is killed cleans nothing up, and is meant not to.
-    "PYTHONWARNINGS": "ignore:resource_tracker",
+    "PYTHONWARNINGS": "ignore:resource_tracker,ignore:Cannot enable progress bars",
 }
 
 
