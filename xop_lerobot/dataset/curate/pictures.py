@@ -73,12 +73,14 @@ def index_video(root: Path, file: Path) -> VideoIndex:
     """
     pts, keys = [], []
     try:
+        size = (root / file).stat().st_size
         with av.open(str(root / file)) as container:
             stream = container.streams.video[0]
             for packet in container.demux(stream):
                 if packet.pts is None or packet.dts is None:
                     continue
-                if packet.is_corrupt:  # the file is cut off in it
+                # The file may be cut off in it, which the decoder's library does not always tell.
+                if packet.is_corrupt or (packet.pos or 0) + packet.size > size:
                     break
                 pts.append(packet.pts)
                 keys.append(packet.is_keyframe)

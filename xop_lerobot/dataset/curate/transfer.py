@@ -211,12 +211,13 @@ class _Writer:
 
     def _count(self, tasks: Sequence[str], length: int) -> dict[str, np.ndarray]:
         frames = np.arange(length)
+        numbers = {task: self.meta.get_task_index(task) for task in dict.fromkeys(tasks)}
         return {
             "timestamp": (frames / self._fps).astype(np.float32),
             "frame_index": frames,
             "episode_index": np.full(length, self.meta.total_episodes),
             "index": frames + self.meta.total_frames,
-            "task_index": np.array([self.meta.get_task_index(task) for task in tasks]),
+            "task_index": np.array([numbers[task] for task in tasks]),
         }
 
     def _number_subtasks(self, table: pa.Table, names: Mapping[int, str]) -> np.ndarray:
