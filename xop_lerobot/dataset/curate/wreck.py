@@ -38,6 +38,8 @@ from xop_lerobot.errors import BadDataset
 
 _COUNTERS = ("episode_index", "frame_index", "task_index")
 _TASKS = Path("meta") / "tasks.parquet"
+# What reading a parquet file raises that is not what it should be; names may be no text.
+_UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError)
 
 
 @dataclass
@@ -96,11 +98,11 @@ def _lay_out_rows(
         try:
             table = _read_counters(path)
             target.symlink_to(path.resolve())
-        except (pa.ArrowException, OSError):
+        except _UNREADABLE:
             try:
                 count = salvage(path, schema, target)
                 table = _read_counters(target)
-            except (CannotSalvage, pa.ArrowException, OSError) as fault:
+            except (CannotSalvage, *_UNREADABLE) as fault:
                 wreck.notes.append(f"{name} is not readable ({_first_line(fault)}): left out")
                 target.unlink(missing_ok=True)
                 continue
@@ -131,7 +133,7 @@ def _read_known(wreck: Wreck, info: dict[str, Any], folder: Path) -> dict[int, E
         try:
             with pq.ParquetFile(path) as file:
                 file.read(use_threads=False)
-        except (pa.ArrowException, OSError) as error:
+        except _UNREADABLE as error:
             wreck.notes.append(f"{name} is not readable ({_first_line(error)}): made anew")
             continue
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -159,7 +161,7 @@ def _find_tasks(
         table = pq.read_table(folder / _TASKS).to_pydict()
         names = next(values for key, values in table.items() if key != "task_index")
         return dict(zip(table["task_index"], map(str, names), strict=True))
-    except (pa.ArrowException, OSError, KeyError, StopIteration):
+    except (*_UNREADABLE, KeyError, StopIteration):
         wreck.notes.append(f"{_TASKS} is not readable: made anew of what the episodes say")
     tasks: dict[int, str] = {}
     for index, (_, table) in rows.items():
