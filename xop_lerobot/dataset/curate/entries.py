@@ -15,6 +15,8 @@ import pyarrow.parquet as pq
 from xop_lerobot.dataset.facts import EPISODES_FILE, FACTS_PREFIX
 from xop_lerobot.errors import BadDataset
 
+UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError)
+"""What reading a malformed parquet file may raise."""
 EPISODES_DIR = Path("meta") / "episodes"
 _REQUIRED = ("episode_index", "length", "data/chunk_index", "data/file_index")
 _TIMES = ("from_timestamp", "to_timestamp")
@@ -126,7 +128,7 @@ def read_entries(
                     raise BadDataset(root, f"episode {entry.index} is listed twice, in {name} too")
                 seen.add(entry.index)
                 yield entry
-        except (pa.ArrowException, OSError) as error:
+        except UNREADABLE as error:
             text = str(error).splitlines()[0]
             _fault(root, note, f"{name} is not readable ({text}). {_REPAIR}")
 

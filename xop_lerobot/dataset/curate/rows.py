@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from xop_lerobot.dataset.curate.column_check import find_faults
-from xop_lerobot.dataset.curate.entries import EpisodeEntry
+from xop_lerobot.dataset.curate.entries import UNREADABLE, EpisodeEntry
 from xop_lerobot.errors import BadDataset
 
 INDEX = "episode_index"
@@ -64,7 +64,7 @@ class RowReader:
         """
         try:
             self._open(entry.file)
-        except (pa.ArrowException, OSError) as error:
+        except UNREADABLE as error:
             raise self._make_unreadable(entry, error) from error
         if self._faults:
             raise BadDataset(self._root, f"{entry.file} {'; it '.join(self._faults)}")
@@ -81,7 +81,7 @@ class RowReader:
             names = [key for key, each in self._features.items() if each["dtype"] != "video"]
         try:
             table = self._read_table(entry, tuple(names))
-        except (pa.ArrowException, OSError) as error:
+        except UNREADABLE as error:
             raise self._make_unreadable(entry, error) from error
         if table.num_rows != entry.length:
             raise BadDataset(

@@ -33,7 +33,7 @@ class VideoCheck:
         dt = 1 / self._source.fps
         for key, span in entry.videos.items():
             if self._last.get(key, (None,))[0] != span.file:
-                self._last[key] = (span.file, *_probe(self._source.root / span.file))
+                self._last[key] = (span.file, *probe(self._source.root / span.file))
             _, fault, end = self._last[key]
             frames = (span.stop - span.start) / dt
             if fault:
@@ -51,8 +51,8 @@ class VideoCheck:
         return problems
 
 
-def _probe(path: Path) -> tuple[str, float]:
-    """Return what is wrong with a file, empty if nothing, and when its pictures end [s]."""
+def probe(path: Path) -> tuple[str, float]:
+    """Return what is wrong with a video, empty if nothing, and when its pictures end [s]."""
     if not path.is_file():
         return "there is no such file", 0.0
     try:
