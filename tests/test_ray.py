@@ -51,6 +51,11 @@ def test_a_worker_that_dies_or_fails_costs_its_own_job_alone(cluster):
     assert set(results["threads"].value) == {"1"}
 
 
+def test_more_workers_than_cores_take_turns(cluster):
+    results = run_jobs_on_ray(do, [1, 2, 3, 4], 4, address="local")
+    assert sorted(each.value[0] for each in results) == [2, 4, 6, 8]
+
+
 def test_machines_must_have_the_same_versions(cluster, monkeypatch):
     versions = json.loads(read_versions()) | {"mujoco": "2.0.0"}
     monkeypatch.setattr(pool_ray, "read_versions", lambda: json.dumps(versions))

@@ -149,6 +149,8 @@ def drive(crew: Crew, jobs: Iterable[Any], workers: int, tries: int) -> Generato
                 busy.append(worker)
                 worker.job, worker.tries = order
                 worker.give(worker.job)
+            while idle:  # there is nothing left for them, and others may wait for their cores
+                idle.pop().stop()
             if not busy:
                 return
             for worker in crew.wait(busy):
