@@ -278,10 +278,14 @@ def _find_idle(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | Non
     return _find_command(features, entry)
 
 
-def find_idle(episode: Episode) -> np.ndarray:
+def find_idle(episode: Episode, limit: float = quality.STILL_LIMIT_M) -> np.ndarray:
     """Find the idle frames, by the poses of person and robot, else by the action. Shape (n,).
 
     Where a policy drove, nobody ever engaged, and it is the robot's motion that counts.
+
+    Args:
+        episode: The episode, with the columns of `IDLE`.
+        limit: How far a point of a pose moves that stands still [m].
     """
     engaged = episode.engaged if episode.engaged.any() else ~episode.engaged
     if ACTION in episode.rows:
@@ -290,7 +294,7 @@ def find_idle(episode: Episode) -> np.ndarray:
     poses = [rows for key, rows in episode.rows.items() if key != ENGAGED]
     # Zeros are no pose: what was not seen, or not yet.
     known = [pose for pose in poses if pose[:, 3:].any(axis=1).all()]
-    return quality.find_idle(known, engaged, episode.dt)
+    return quality.find_idle(known, engaged, episode.dt, limit)
 
 
 def _compute_idle(episode: Episode) -> Values:

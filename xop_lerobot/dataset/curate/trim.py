@@ -18,21 +18,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xop_lerobot.command_line import CommandParser
+from xop_lerobot.dataset import quality
 from xop_lerobot.dataset.curate.arguments import (
     add_destination,
     add_source,
     make_destination,
     show_progress,
 )
+from xop_lerobot.dataset.curate.measures import IDLE, Episode, find_idle
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
-from xop_lerobot.dataset.quality import (
-    STILL_LIMIT_M,
-    find_active_span,
-    find_idle,
-    find_still,
-)
 from xop_lerobot.errors import BadDataset, BadValue
-from xop_lerobot.state import FRAMES
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip
@@ -40,10 +35,7 @@ if TYPE_CHECKING:
 SUMMARY = "cut idle starts and ends"
 
 _ENDS = ("start", "end", "both")
-_ENGAGED, _ACTION = "operator.engaged", "action"
 _OUTCOME = ("next.success", "next.done")
-_SHARE = 0.02
-"""Share of its range in the episode by which an action that stands still varies."""
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -60,10 +52,10 @@ def add_arguments(parser: CommandParser) -> None:
     parser.add_argument(
         "--limit",
         type=float,
-        default=STILL_LIMIT_M,
+        default=quality.STILL_LIMIT_M,
         metavar="M",
         help="how far what stands still moves within half a second [m] "
-        f"(default: {STILL_LIMIT_M:g})",
+        f"(default: {quality.STILL_LIMIT_M:g})",
     )
     parser.add_argument(
         "--ends", choices=_ENDS, default="both", help="what is cut: start, end or both (default)"
@@ -105,30 +97,16 @@ class Trimmer:
         margin: Idle time that stays [s].
         limit: How far what stands still moves [m].
         ends: `start`, `end` or `both`.
-
-    Raises:
-        BadDataset: If it has no column that tells whether anything moves.
     """
 
     def __init__(
-        self, source: Source, margin: float, limit: float = STILL_LIMIT_M, ends: str = "both"
+        self,
+        source: Source,
+        margin: float,
+        limit: float = quality.STILL_LIMIT_M,
+        ends: str = "both",
     ) -> None:
         self._source, self._margin, self._limit, self._ends = source, margin, limit, ends
-        names = (f"operator.{frame}" for frame in FRAMES)
-        robot = (key for key in source.features if key.startswith("robot."))
-        self._poses = [
-            key
-            for key in (*names, *robot)
-            if source.features.get(key, {}).get("shape") == [7] and key in source.features
-        ]
-        if _ENGAGED not in source.features or not self._poses:
-            self._poses = []
-            if _ACTION not in source.features:
-                raise BadDataset(
-                    source.root,
-                    "it has neither poses of an operator nor an action, so nothing tells what is "
-                    f"idle. Its columns: {', '.join(sorted(source.features))}",
-                )
         self._lines: list[str] = []
         self._frames = self._kept = 0
 
@@ -148,7 +126,7 @@ class Trimmer:
     def find_span(self, entry: EpisodeEntry) -> tuple[int, int]:
         """Find the first frame that stays, and the one after the last; all if nothing moves."""
         idle = self._find_idle(entry)
-        start, stop = find_active_span(idle)
+        start, stop = quality.find_active_span(idle)
         if start == stop:
             return 0, entry.length
         margin = round(self._margin * self._source.fps)
@@ -162,19 +140,17 @@ class Trimmer:
         return start, stop
 
     def _find_idle(self, entry: EpisodeEntry) -> np.ndarray:
-        source, dt = self._source, 1 / self._source.fps
-        if not self._poses:
-            action = source.read(entry, [_ACTION])[_ACTION].astype(float)
-            spread = np.ptp(action, axis=0)
-            moving = action[:, spread > 0] / spread[spread > 0]
-            return find_still(moving, dt, _SHARE)
-        columns = source.read(entry, [*self._poses, _ENGAGED])
-        engaged = columns[_ENGAGED][:, 0].astype(bool)
-        if not engaged.any():  # a policy drove
-            engaged[:] = True
-        # What was not seen yet, or never, is 0, and no pose.
-        poses = [columns[key] for key in self._poses if columns[key][:, 3:].any(axis=1).all()]
-        return find_idle(poses, engaged, dt, self._limit)
+        source = self._source
+        columns = IDLE.find_columns(source.features, entry)
+        if columns is None:
+            raise BadDataset(
+                source.root,
+                "it has neither poses of an operator nor an action, so nothing tells what is "
+                f"idle. Its columns: {', '.join(sorted(source.features))}",
+            )
+        rows = source.read(entry, columns)
+        episode = Episode(entry, source.features, rows, 1 / source.fps, source.robot)
+        return find_idle(episode, self._limit)
 
     def _end_outcome(self, entry: EpisodeEntry, span: tuple[int, int]) -> dict[str, np.ndarray]:
         """Let the last row say what the last row of the whole episode said."""
