@@ -8,8 +8,9 @@ import pytest
 
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.retarget.arm_bias import ArmBias
-from xop_lerobot.retarget.arm_hold import HOLDING_S, ArmHold
+from xop_lerobot.retarget.arm_hold import CARRYING_S, HOLDING_S, ArmHold
 from xop_lerobot.retarget.arm_load import ArmLoad
+from xop_lerobot.retarget.arm_yield import MOST_SQUEEZE, MOST_WAY, ArmYield
 from xop_lerobot.transforms import make_pose, pose_multiply, quat_from_rpy
 
 DT = 0.04
@@ -63,7 +64,7 @@ def test_what_is_held_sways_with_the_body():
         against = []
         for head in heads:
             hold.update(force, RIGHT - LEFT)
-            goals = hold.smooth(GOALS, head, DT)
+            goals = hold.smooth(GOALS, head, head, DT)
             against.append(goals["left_wrist"][1] - head[1])
         free = np.ptp([LEFT[1] - head[1] for head in heads[50:]])
         swing = np.ptp(against[50:])
@@ -76,12 +77,12 @@ def test_held_hands_follow_a_lasting_change_and_are_let_go_without_a_step():
     up = make_pose(np.array([0, 0, 0.1]), NO_TURN)
     higher = {name: pose_multiply(up, pose) for name, pose in GOALS.items()}
     hold.update(SQUEEZE, RIGHT - LEFT)
-    hold.smooth(GOALS, head, DT)
+    hold.smooth(GOALS, head, head, DT)
     heights = []
     for tick in range(100):
         if tick == round(HOLDING_S / DT):
             hold.update(0 * SQUEEZE, RIGHT - LEFT)  # let go half way
-        heights.append(hold.smooth(higher, head, DT)["left_wrist"][2])
+        heights.append(hold.smooth(higher, head, head, DT)["left_wrist"][2])
     assert np.diff(heights, prepend=0.8).max() < 0.02
     assert heights[-1] == pytest.approx(0.9)
 
@@ -96,3 +97,50 @@ def test_hands_that_push_apart_hold_nothing():
     assert hold.is_holding
     hold.update(0.05 * SQUEEZE, RIGHT - LEFT)
     assert not hold.is_holding
+
+
+def test_who_walks_with_something_has_it_sway_with_the_body_all_the_more():
+    swings = {}
+    for walking in (False, True):
+        hold, against = ArmHold(), []
+        hold.update(SQUEEZE, RIGHT - LEFT)
+        for tick in range(400):
+            sway = 0.03 * np.sin(2 * np.pi * 0.8 * tick * DT)
+            head = make_pose(np.array([0, sway, 1.2]), NO_TURN)
+            goals = hold.smooth(GOALS, head, head, DT, walking=walking)
+            against.append(goals["left_wrist"][1] - head[1])
+        swings[walking] = np.ptp(against[200:])
+    # First-order filters above their corner frequency.
+    assert swings[True] / swings[False] == pytest.approx(HOLDING_S / CARRYING_S, rel=0.1)
+
+
+def test_what_is_smoothed_does_not_tremble_with_the_head_that_was_measured():
+    hold, rng = ArmHold(), np.random.default_rng(0)
+    steady = make_pose(np.array([0, 0, 1.2]), NO_TURN)
+    hold.update(SQUEEZE, RIGHT - LEFT)
+    heights = []
+    for _ in range(200):
+        head = steady + [0, 0, rng.normal(0, 0.005), 0, 0, 0, 0]
+        heights.append(hold.smooth(GOALS, head, steady, DT)["left_wrist"][2])
+    assert np.std(np.diff(heights)) < 0.001
+    hold.reset()  # free hands are where they shall be in the world
+    np.testing.assert_array_equal(
+        hold.smooth(GOALS, head, steady, DT)["left_wrist"], GOALS["left_wrist"]
+    )
+
+
+def test_hands_that_squeeze_too_hard_give_way_until_they_do_not():
+    stiffness, inside, felt, hands = 1e4, 0.01, 0.0, ArmYield()  # 100 N if nothing gave way
+    for _ in range(200):
+        force = stiffness * (inside - hands.way)
+        felt += -np.expm1(-DT / 0.3) * (force - felt)
+        hands.update(felt, DT)
+    assert force == pytest.approx(MOST_SQUEEZE, rel=0.02)
+    left, right = hands.part(LEFT, RIGHT)
+    np.testing.assert_allclose(left - LEFT, [0, hands.way, 0])
+    np.testing.assert_allclose(right - RIGHT, [0, -hands.way, 0])
+    for _ in range(100):  # something less thick is between them
+        hands.update(20.0, DT)
+    assert hands.way == 0
+    hands.update(1e6, 10.0)
+    assert hands.way == MOST_WAY

@@ -442,6 +442,7 @@ def test_lateral_is_the_angle_to_where_the_base_shall_face(share):
         (0.0, [-1.0, 0.0], 0.0, 0.0),  # behind: it backs up, and does not turn round
         (0.1, [0.0, 10.0], 0.0, 1.56),  # far to the left: it turns there
         (-1.2, [0.0, 10.0], 0.0, -1.56),  # facing away already: it backs up there
+        (-0.5, [-2.3, 9.7], 1.8, 1.8),  # the same, but no waist twists that far: it turns round
         (0.0, [0.0, 0.1], 0.0, math.pi / 4),  # near the line, it closes in on it
         (0.0, [0.0, 0.0], 0.4, 0.4),  # there: it faces as the goal looks
     ],
@@ -459,7 +460,7 @@ def test_where_a_base_on_wheels_shall_face(heading, velocity, look, facing):
 def test_the_last_centimetres_are_left_to_the_waist():
     lengths = [
         np.hypot(*compute_facing(0.0, np.array([0.3, 0.3]), 0.0, speed))
-        for speed in (0.0, 0.15, 0.225, 0.3, 2.0)
+        for speed in (0.0, 0.08, 0.14, 0.2, 2.0)
     ]
     np.testing.assert_allclose(lengths, [0, 0, 0.5, 1, 1])
 

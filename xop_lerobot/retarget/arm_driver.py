@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import mujoco
 import numpy as np
 
+from xop_lerobot.command import Mode
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arm_bias import ArmBias
 from xop_lerobot.retarget.arm_hold import ArmHold
 from xop_lerobot.retarget.arm_ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
 from xop_lerobot.retarget.arm_load import ArmLoad
+from xop_lerobot.retarget.arm_yield import ArmYield
 from xop_lerobot.retarget.servo_filter import SteadyBody
 from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
 from xop_lerobot.state import FRAMES, Goal, RobotState
+from xop_lerobot.transforms import make_pose, quat_from_matrix
 
 BIAS_TIME = 1.5
 """Time in which offsets of the arms are learned [s]. With 0.5 s the arms of G1, which are soft,
@@ -42,6 +46,8 @@ class ArmDriver:
         self._body = SteadyBody(morphology, self.ik.model)
         self.load = ArmLoad(morphology)
         self.hold = ArmHold()
+        self.giving = ArmYield()
+        self._data = mujoco.MjData(self.ik.model)
         self._joints = [joint for arm in morphology.arms for joint in arm.joints]
         self.forget()
 
@@ -81,15 +87,12 @@ class ArmDriver:
             self._body.reset()
             self.load.reset()
             self.hold.reset()
+            self.giving.reset()
         self._decided = frozenset(decided)
         self.load.update(state.qpos, state.effort, dt)
-        wrists = compute_wrist_goals(self._find_ik_goals(goal), head)
-        if len(wrists) == len(self.morphology.arms) == 2:  # noqa: PLR2004 a left and a right hand
-            left, right = (wrists[arm.frame][:3] for arm in self.morphology.arms)
-            self.hold.update(self.load.force, right - left)
-            wrists = self.hold.smooth(wrists, head, dt)
         # What the encoders of the body tremble by, the hands would make up for in earnest.
         body = self._body.update(state.qpos, state.command, dt)
+        wrists = self._find_wrists(goal, head, body, dt)
         last, wanted = self._wanted, self.ik.solve(body, self._wanted, wrists, dt)
         planned = np.zeros(num_joints, dtype=bool)
         for name, angle in decided.items():
@@ -103,6 +106,44 @@ class ArmDriver:
         # The plan's prediction has the offset of the low-level policy in it.
         targets = np.where(planned, wanted, self.bias.compute_targets(wanted))
         return np.concatenate([targets, self.compute_grippers(goal)])
+
+    def _find_wrists(
+        self, goal: Goal, head: np.ndarray, body: np.ndarray, dt: float
+    ) -> dict[str, np.ndarray]:
+        """Where the wrists shall be in the world. Shapes (7,)."""
+        goals = self._find_ik_goals(goal)
+        hands = [arm.frame for arm in self.morphology.arms if arm.frame in goals]
+        if len(hands) != 2:  # noqa: PLR2004 a left and a right hand
+            return compute_wrist_goals(goals, head)
+        left, right = hands
+        walking = goal.mode is Mode.MOBILE
+        self.hold.update(self.load.force, goals[right][:3] - goals[left][:3])
+        self.giving.update(self.hold.squeeze, dt)
+        if self.hold.is_holding and walking:
+            # What is carried goes with the body, however far that is from its goal: arms that
+            # stretch aside shear what is between them.
+            wrists = compute_wrist_goals(goals, head, max_offset=0.0, max_turn=0.0)
+        else:
+            wrists = compute_wrist_goals(goals, head)
+        wrists = self.hold.smooth(
+            {name: wrists[name] for name in hands},
+            head,
+            self._compute_head(body),
+            dt,
+            walking=walking,
+        )
+        places = self.giving.part(wrists[left][:3], wrists[right][:3])
+        return {
+            name: make_pose(place, wrists[name][3:])
+            for name, place in zip(hands, places, strict=True)
+        }
+
+    def _compute_head(self, qpos: np.ndarray) -> np.ndarray:
+        """Pose of the head in a configuration. Shape (7,)."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.ik.model, self._data)
+        site = self._data.site(self.morphology.frames["head"])
+        return make_pose(site.xpos, quat_from_matrix(site.xmat.reshape(3, 3)))
 
     def _compute_freedom(self) -> np.ndarray:
         """How freely each joint's arm moves, from 1 down to 0 for one that presses. Shape (n,)."""

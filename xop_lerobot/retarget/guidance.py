@@ -20,7 +20,7 @@ from xop_lerobot.state import Goal
 from xop_lerobot.transforms import quat_from_yaw, quat_multiply
 
 _LOOK_AHEAD = 1.6  # length of a way that is looked at: about a quarter turn [s]
-_STILL = 0.2  # speed of a goal under which it counts as standing still [m/s]
+_STILL = 0.1  # speed of a goal under which it counts as standing still [m/s]
 
 
 class Guidance:

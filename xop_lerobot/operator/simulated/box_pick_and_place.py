@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Generator
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from xop_lerobot.operator.simulated.hands import (
     reach,
     shift_hands,
     take_posture,
+    tip_hands,
 )
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
 from xop_lerobot.operator.simulated.walking import compute_miss, find, glance, go_to, set_mode
@@ -70,8 +72,12 @@ GRASPS = 4
 """How often a person takes hold anew before giving up."""
 LIFT = 0.06
 """How high the box is lifted [m]."""
-LIFTED = 0.035
+LIFTED = 0.037
 """Rise from which the person is sure to have lifted it [m]."""
+LIFTS = 3
+"""How often a person lifts on, if the robot's arms come up less than the own."""
+LEFT_BEHIND = 0.015
+"""A box that rises so much less than the hands stays behind [m]."""
 HOLD_S = 3.6
 """How long the lifted box is held [s]."""
 BESIDE_TOLERANCE = 0.02
@@ -86,8 +92,14 @@ STRAIGHTEN_S = 2.5
 """Time to stand up straight with a box [s]."""
 BACK = 0.35
 """How far the person steps back from the support [m]."""
-PLACE_NEAR = 0.03
+WALK_NEAR = 0.06
+"""How far beside its spot the box may be when one has walked there; the hands do the rest [m]."""
+PLACE_NEAR = 0.04
 """How far beside the spot the box may be put down [m]."""
+
+LEVEL, LEVELLINGS, TIP_SPEED = 0.08, 3, 0.15
+"""Tilt at which a box is level enough to be put down [rad], how often a person tips it, and how
+fast [rad/s]."""
 
 
 class OutOfReach(Exception):
@@ -201,18 +213,43 @@ def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
         yield from bring_beside(mind)
         rest = float(mind.eyes.pose("box")[2])
         yield from close(mind, press + SURE + harder + attempt * PRESS_MORE)
-        mind.note("lift")
-        yield from shift_hands(mind, np.array([0, 0, LIFT]), CARRY_SPEED)
-        yield from mind.settle()
-        rise = float(mind.eyes.pose("box")[2]) - rest
-        mind.note(f"box rose {100 * rise:.0f} cm")
+        rise, lifted = yield from lift(mind, rest)
         if rise > LIFTED:
             yield from mind.pause(HOLD_S)
             check_held(mind)
             return
-        yield from shift_hands(mind, np.array([0, 0, -LIFT]), CARRY_SPEED)
+        yield from shift_hands(mind, np.array([0, 0, -lifted]), CARRY_SPEED)
         yield from open_hands(mind)
     raise GaveUp("the box slips out of the hands")
+
+
+def lift(mind: Mind, rest: float) -> Generator[None, None, tuple[float, float]]:
+    """Lift the box; further, if the robot's arms come up less than the own but with the box.
+
+    Args:
+        mind: Who lifts.
+        rest: Height at which the box stood [m].
+
+    Returns:
+        Rise of the box as seen, and of the goals of the hands [m].
+    """
+    before, lifted = _see_hands(mind), 0.0
+    for _ in range(LIFTS):
+        mind.note("lift")
+        step = LIFT - max(0.0, _see_hands(mind) - before)
+        yield from shift_hands(mind, np.array([0, 0, step]), CARRY_SPEED)
+        yield from mind.settle()
+        lifted += step
+        rise, hands = float(mind.eyes.pose("box")[2]) - rest, _see_hands(mind) - before
+        mind.note(f"box rose {100 * rise:.0f} cm, hands {100 * hands:.0f} cm")
+        if rise > LIFTED or hands - rise > LEFT_BEHIND or hands > LIFTED + LEFT_BEHIND:
+            break
+    return rise, lifted
+
+
+def _see_hands(mind: Mind) -> float:
+    """Mean height of both palms [m]."""
+    return float(np.mean([mind.feel(f"{side}_palm")[2] for side in SIDES]))
 
 
 def keep_distance(mind: Mind) -> Doing:
@@ -352,9 +389,9 @@ def walk_to_table(mind: Mind) -> Doing:
         heading = choose_heading(mind, "spot")
         place = compute_carry_place(mind, heading)
         miss, _ = compute_miss(mind, place)
-        if miss <= PLACE_NEAR:
+        if miss <= WALK_NEAR:
             break
-        yield from go_to(mind, place, hands=hands, laden=True, tolerance=PLACE_NEAR, tries=3)
+        yield from go_to(mind, place, hands=hands, laden=True, tolerance=WALK_NEAR, tries=3)
     yield from set_mode(mind, Mode.STATIONARY)
 
 
@@ -397,6 +434,7 @@ def put_down(mind: Mind) -> Doing:
         if off <= PLACE_NEAR:
             break
         yield from shift_hands(mind, mind.person.hand_gain * error, CARRY_SPEED)
+    yield from level(mind)
     for _ in range(4):
         yield from mind.settle("left_palm", "right_palm")
         check_held(mind)
@@ -409,6 +447,19 @@ def put_down(mind: Mind) -> Doing:
     yield from open_hands(mind)
     yield from shift_hands(mind, np.array([0, 0, 0.05]), 2 * CARRY_SPEED)
     yield from mind.pause(3.0)
+
+
+def level(mind: Mind) -> Doing:
+    """Tip the hands until the box is level."""
+    for _ in range(LEVELLINGS):
+        yield from mind.settle("left_palm", "right_palm")
+        pose = mind.eyes.pose("box")
+        up = quat_rotate(pose[3:], np.array([0, 0, 1.0]))
+        tilt = float(np.arcsin(up @ compute_ahead(compute_heading(mind.eyes.pose("head")[3:]))))
+        mind.note(f"box tilted by {np.degrees(tilt):.0f}°")
+        if abs(tilt) < LEVEL:
+            return
+        yield from tip_hands(mind, -tilt, TIP_SPEED)
 
 
 def compute_height_over_spot(mind: Mind) -> float:

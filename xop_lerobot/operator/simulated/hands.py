@@ -13,6 +13,7 @@ from xop_lerobot.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
+    quat_exp,
     quat_from_matrix,
     quat_from_yaw,
     quat_multiply,
@@ -244,6 +245,28 @@ def shift_hands(mind: Mind, way: np.ndarray, speed: float) -> Doing:
     goals = {side: np.array([*(room[i][:3] + own), *room[i][3:]]) for i, side in enumerate(SIDES)}
     duration = max(length / speed, compute_reach_time(mind, length))
     mind.body.move(mind.body.with_hands_in_room(mind.body.posture, goals), duration)
+    yield from mind.finish()
+
+
+def tip_hands(mind: Mind, angle: float, speed: float) -> Doing:
+    """Turn both hands about the line between the palms, and what they hold with them.
+
+    Args:
+        mind: Who moves.
+        angle: Turn, positive tips the far side down [rad].
+        speed: Mean rate of the turn [rad/s].
+    """
+    room = mind.body.compute_hands_in_room()
+    palms = [pose[:3] + quat_rotate(pose[3:], np.array([HAND, 0, 0])) for pose in room]
+    turn = quat_exp(angle * _unit(palms[0] - palms[1]))
+    middle = (palms[0] + palms[1]) / 2
+    goals = {}
+    for side, pose in zip(SIDES, room, strict=True):
+        place = middle + quat_rotate(turn, pose[:3] - middle)
+        goals[side] = make_pose(place, quat_multiply(turn, pose[3:]))
+    mind.body.move(
+        mind.body.with_hands_in_room(mind.body.posture, goals), max(1.0, abs(angle) / speed)
+    )
     yield from mind.finish()
 
 

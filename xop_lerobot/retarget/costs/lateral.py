@@ -10,9 +10,11 @@ from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.transforms import quat_yaw, wrap_angle
 
 _LOOKING = 0.1  # speed at which the way to go and where the goal looks count alike [m/s]
-_REST, _FULL = 0.15, 0.3  # speeds of the head from which on the base is to face so [m/s]
+_REST, _FULL = 0.08, 0.2  # speeds of the head from which on the base is to face so [m/s]
 _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
 _BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
+_MAX_TWIST = 1.9  # twist of the waist beyond which the base does not face so [rad]
+_TOO_TWISTED = 10.0  # how much a twist beyond it counts
 
 
 def compute_facing(heading: float, velocity: np.ndarray, look: float, speed: float) -> np.ndarray:
@@ -42,7 +44,8 @@ def compute_facing(heading: float, velocity: np.ndarray, look: float, speed: flo
         x, y = sign * velocity + ahead
         facing = math.atan2(y, x)
         effort += abs(float(wrap_angle(facing - heading)))  # noqa: PLW2901
-        effort += _TWIST * abs(float(wrap_angle(facing - look)))  # noqa: PLW2901
+        twist = abs(float(wrap_angle(facing - look)))
+        effort += _TWIST * twist + _TOO_TWISTED * max(twist - _MAX_TWIST, 0.0)  # noqa: PLW2901
         if effort < least:
             best, least = facing, effort
     share = min(max((speed - _REST) / (_FULL - _REST), 0.0), 1.0)
