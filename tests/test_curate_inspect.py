@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from lerobot.datasets import LeRobotDataset
 
 from xop_lerobot.dataset.columns import HEALTH_NAMES
 from xop_lerobot.dataset.curate.cli import main
+from xop_lerobot.dataset.curate.expression import Expression
 from xop_lerobot.dataset.curate.figures import FIGURES
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.curate.survey import survey
@@ -26,7 +28,6 @@ from xop_lerobot.errors import BadDataset
 REPO = Path(__file__).parents[1]
 EPISODES = 6
 FRAMES = 100
-SOME = {"success": True, "fall": False}
 
 
 @pytest.fixture(scope="module")
@@ -442,3 +443,55 @@ def test_memory_does_not_grow_with_the_dataset(tmp_path):
         peaks.append(int(done.stdout) / 1024)
     rows = 55 * 2000 * 216 * 4 / 1e6
     assert peaks[1] - peaks[0] < rows / 3, f"{peaks} MB; the rows that came on top are {rows} MB"
+
+
+# Crashes.
+
+
+def test_ctrl_c_leaves_everything_as_it_was(data, capsys, monkeypatch):
+    before = compute_digests(data)
+    monkeypatch.setattr(Expression, "evaluate", interrupt_at(3))
+    flags = ["filter", "--root", str(data), "--where", "duration > 0"]
+    assert main([*flags, "--in-place"]) == 130
+    assert capsys.readouterr().err == "stopped; nothing was changed\n"
+    monkeypatch.setattr(Expression, "evaluate", interrupt_at(3))
+    assert main([*flags, "--out", str(data.parent / "deep" / "out")]) == 130
+    assert compute_digests(data) == before
+    assert [path.name for path in data.parent.iterdir()] == ["data"]
+
+
+def interrupt_at(count: int):
+    """An `evaluate` that is interrupted when it is called for the `count`th time."""
+    calls = []
+
+    def evaluate(expression, values) -> bool:
+        calls.append(values)
+        if len(calls) == count:
+            raise KeyboardInterrupt
+        return True
+
+    return evaluate
+
+
+def test_kill_leaves_the_source_and_the_next_run_goes_through(data):
+    before = compute_digests(data)
+    where = "duration > 0 and episode != 1"
+    flags = ["filter", "--root", str(data), "--where", where, "--in-place"]
+    code = (
+        "import os, signal\n"
+        "from xop_lerobot.dataset.curate.cli import main\n"
+        "from xop_lerobot.dataset.curate.expression import Expression\n"
+        "stock = Expression.evaluate\n"
+        "def evaluate(self, values):\n"
+        "    if values['episode'] == 4: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    return stock(self, values)\n"
+        "Expression.evaluate = evaluate\n"
+        f"main({flags!r})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=REPO, capture_output=True)
+    assert done.returncode == -signal.SIGKILL
+    assert compute_digests(data) == before
+    assert {path.name for path in data.parent.iterdir()} == {"data", ".data.curating"}
+    assert main(flags) == 0
+    assert [row["episode_index"] for row in read_facts(data)] == list(range(EPISODES - 1))
+    assert [path.name for path in data.parent.iterdir()] == ["data"]
