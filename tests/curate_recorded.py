@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pandas as pd
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.io_utils import load_stats
 from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 from toy_robot import make_teleop, make_toy
@@ -81,15 +83,25 @@ def make_packed(
     return dataset
 
 
-def read_rows(root: Path, episode: int) -> pd.DataFrame:
+def load(repo_id: str, root: Path | str) -> Any:
+    """Load a dataset with LeRobot. Its rows are dicts, whatever its annotations say."""
+    return LeRobotDataset(repo_id, root=root)
+
+
+def read_rows(root: Path, episode: int) -> Any:
     table = pd.concat(pd.read_parquet(file) for file in sorted(root.glob("data/*/*.parquet")))
     return table[table.episode_index == episode].reset_index(drop=True)
 
 
-def read_metadata(root: Path) -> pd.DataFrame:
+def read_metadata(root: Path) -> Any:
     files = sorted(root.glob("meta/episodes/*/*.parquet"))
     table = pd.concat((pd.read_parquet(file) for file in files), ignore_index=True)
     return table.set_index("episode_index", drop=False).sort_index()
+
+
+def read_stats(root: Path) -> Any:
+    """Statistics of a whole dataset by column and kind."""
+    return load_stats(root)
 
 
 def read_pictures(root: Path, episode: int, key: str, fps: float) -> np.ndarray:
@@ -98,9 +110,10 @@ def read_pictures(root: Path, episode: int, key: str, fps: float) -> np.ndarray:
     chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
     path = root / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
     start = row[f"videos/{key}/from_timestamp"]
+    frames: dict[int, np.ndarray] = {}
     with av.open(str(path)) as container:
         frames = {
-            round(float(frame.pts * frame.time_base) * fps): frame.to_ndarray(format="rgb24")
+            round(float(frame.pts * (frame.time_base or 0)) * fps): frame.to_ndarray(format="rgb24")
             for frame in container.decode(video=0)
         }
     first = round(start * fps)

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from curate_data import compute_digests
-from curate_recorded import read_pictures, read_rows
-from lerobot.datasets import LeRobotDataset
+from curate_recorded import load, read_pictures, read_rows
 
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.facts import read_facts
@@ -82,7 +81,7 @@ def test_repair(mixed, name, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "of an unfinished episode: left out" in said
     assert "whole: 3 episodes" in said
-    dataset = LeRobotDataset("local/out", root=out)
+    dataset = load("local/out", root=out)
     assert dataset.num_episodes == 3
     dataset[len(dataset) - 1]
     if name == "killed_stock":  # it was recorded of the first episodes of the whole session
@@ -105,7 +104,7 @@ def test_killed_session_joins_the_whole_one(mixed, tmp_path):
         assert main([*words, "--quiet"]) == 0, words
     names = {"train": 6, "val": 1}
     for name, count in names.items():
-        dataset = LeRobotDataset("local/part", root=parts / name)
+        dataset = load("local/part", root=parts / name)
         assert dataset.num_episodes == count
         dataset[len(dataset) - 1]
     facts = read_facts(parts / "val")

@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from curate_data import compute_digests, make_foreign, make_synthetic
-from curate_recorded import read_rows, record_toy
-from lerobot.datasets import LeRobotDataset
+from curate_recorded import load, read_rows, record_toy
 
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.frame_rules import FrameRules, list_entries
@@ -58,7 +57,7 @@ def test_success_by_rule(base, tmp_path, capsys):
         column = read_rows(tmp_path / "out", episode)["next.success"]
         assert bool(column.iloc[-1]) == new[episode]
         assert new[episode] or not column.any()
-    dataset = LeRobotDataset("local/out", root=tmp_path / "out")
+    dataset = load("local/out", root=tmp_path / "out")
     assert bool(dataset[2 * FRAMES - 1]["next.success"])
 
 
@@ -87,6 +86,7 @@ def test_subtasks_by_rule(base, tmp_path, capsys):
     names = pd.read_parquet(tmp_path / "out/meta/subtasks.parquet")
     assert names.index.tolist() == ["first", "far", "other"]
     assert names["subtask_index"].tolist() == [0, 1, 2]
+    runs = []
     for episode in range(EPISODES):
         rows = read_rows(tmp_path / "out", episode)
         time = rows["frame_index"] / FPS

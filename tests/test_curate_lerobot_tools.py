@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from curate_data import compute_digests
-from curate_recorded import read_metadata, read_pictures, read_rows, record_toy
+from curate_recorded import load, read_metadata, read_pictures, read_rows, record_toy
 from huggingface_hub.utils import filter_repo_objects
-from lerobot.datasets import LeRobotDataset, lerobot_dataset
+from lerobot.datasets import lerobot_dataset
 
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.source import Source
@@ -57,9 +57,9 @@ def edit(monkeypatch, root: Path, operation: str, *flags: str) -> None:
     lerobot_edit_dataset.main()
 
 
-def check_loads(root: Path, episodes: int) -> LeRobotDataset:
+def check_loads(root: Path, episodes: int) -> Any:
     """LeRobot loads all of it, `xop-curate` too, and no column is missing."""
-    dataset = LeRobotDataset("local/toy", root=root)
+    dataset = load("local/toy", root=root)
     assert dataset.num_episodes == episodes
     for index in (0, len(dataset) // 2, len(dataset) - 1):
         dataset[index]
@@ -166,7 +166,7 @@ def test_push_to_hub(curated, monkeypatch):
 
     monkeypatch.setattr(lerobot_dataset, "HfApi", Hub)
     monkeypatch.setattr(lerobot_dataset, "create_lerobot_dataset_card", make_card)
-    LeRobotDataset("me/toy", root=curated).push_to_hub(private=True)
+    load("me/toy", root=curated).push_to_hub(private=True)
     upload = calls["upload_folder"]
     assert Path(upload["folder_path"]) == curated
     names = list(compute_digests(curated))

@@ -14,10 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from curate_data import compute_digests
-from curate_recorded import CAMERA, FPS, make_packed, read_metadata, read_pictures, read_rows
+from curate_recorded import CAMERA, FPS, load, make_packed, read_metadata, read_pictures, read_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lerobot.datasets import LeRobotDataset
 
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.salvage import CannotSalvage, salvage
@@ -63,7 +62,7 @@ def repair(root: Path, out: Path, capsys=None) -> str:
 
 def check_episodes(out: Path, reference: Path, episodes: list[int]) -> None:
     """`out` holds these episodes of `reference`, in this order."""
-    dataset = LeRobotDataset("local/out", root=out)
+    dataset = load("local/out", root=out)
     assert dataset.num_episodes == len(episodes)
     for number, episode in enumerate(episodes):
         rows, expected = read_rows(out, number), read_rows(reference, episode)
@@ -99,7 +98,7 @@ def killed(tmp_path_factory) -> Path:
 
 def test_killed_session_of_lerobot(killed, whole, tmp_path, capsys):
     with pytest.raises(Exception, match="Repository Not Found|reach|offline|Parquet|parquet|hub"):
-        LeRobotDataset("local/killed", root=killed)
+        load("local/killed", root=killed)
     before = compute_digests(killed)
     said = repair(killed, tmp_path / "out", capsys)
     assert compute_digests(killed) == before

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,16 +14,16 @@ from curate_recorded import (
     CAMERA,
     FPS,
     add_episodes,
+    load,
     make_packed,
     read_metadata,
     read_pictures,
     read_rows,
+    read_stats,
     record_toy,
 )
-from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
-from lerobot.datasets.io_utils import load_stats
 from PIL import Image
 from toy_robot import make_teleop, make_toy
 
@@ -108,8 +110,8 @@ def test_lerobot_reads_the_same(tmp_path):
     make_packed(tmp_path / "packed")
     spans = [(2, (10, 40)), (1, None)]
     copy_clips(tmp_path / "packed", tmp_path / "out", spans)
-    old = LeRobotDataset("local/old", root=tmp_path / "packed")
-    new = LeRobotDataset("local/new", root=tmp_path / "out")
+    old = load("local/old", root=tmp_path / "packed")
+    new = load("local/new", root=tmp_path / "out")
     assert len(new) == 30 + 25
     for row, frame in ((0, 62 + 10), (29, 62 + 39), (30, 37), (54, 61)):
         assert new[row]["task"] == old[frame]["task"]
@@ -134,14 +136,14 @@ def test_twice_the_same(recorded, tmp_path):
 def test_agrees_with_lerobot(recorded, tmp_path):
     """LeRobot's delete and merge, where they keep what they know, give the same."""
     copy_clips(recorded, tmp_path / "ours", [(0, None), (2, None)])
-    stock = LeRobotDataset("local/toy", root=recorded)
+    stock = load("local/toy", root=recorded)
     theirs = delete_episodes(stock, [1], tmp_path / "theirs", "local/theirs")
     for episode in (0, 1):
         ours = read_rows(tmp_path / "ours", episode)
         rows = read_rows(theirs.root, episode)
         pd.testing.assert_frame_equal(ours, rows[ours.columns], check_dtype=False)
-    stats = load_stats(tmp_path / "ours")
-    for key, parts in load_stats(theirs.root).items():
+    stats = read_stats(tmp_path / "ours")
+    for key, parts in read_stats(theirs.root).items():
         if key in (*COUNTED, "task_index"):  # LeRobot keeps those from before the deletion
             continue
         for kind, value in parts.items():
@@ -166,7 +168,7 @@ def test_statistics(recorded, tmp_path):
     episodes = []
     for episode in range(3):
         rows = read_rows(out, episode)
-        data = {key: np.stack(rows[key]) for key in rows.columns}
+        data: dict[str, Any] = {key: np.stack(rows[key]) for key in rows.columns}
         expected = compute_episode_stats(data, features)
         if episode:
             paths = []
@@ -182,7 +184,7 @@ def test_statistics(recorded, tmp_path):
                     actual, np.ravel(value).astype(float), atol=1e-6, err_msg=f"{key} {kind}"
                 )
         episodes.append(expected)
-    whole = load_stats(out)
+    whole = read_stats(out)
     numbers = [{key: each[key] for key in each if key != HEAD} for each in episodes]
     for key, parts in aggregate_stats(numbers).items():
         np.testing.assert_allclose(whole[key]["mean"], parts["mean"], atol=1e-6)
@@ -237,7 +239,7 @@ def test_new_columns_and_another_task(recorded, tmp_path):
         clip = Clip(source, entry, columns={"extra": column}, task="dance", facts={"mood": "good"})
         feature = {"dtype": "int64", "shape": [1], "names": None}
         transfer([clip], tmp_path / "out", Step.now("test"), {"extra": feature})
-    dataset = LeRobotDataset("local/out", root=tmp_path / "out")
+    dataset = load("local/out", root=tmp_path / "out")
     assert int(dataset[7]["extra"]) == 7
     assert dataset[7]["task"] == "dance"
     facts = read_facts(tmp_path / "out")[0]
@@ -248,8 +250,8 @@ def test_new_columns_and_another_task(recorded, tmp_path):
 def test_pictures_in_the_rows(tmp_path):
     root = record_toy(tmp_path / "png", (12, 14), session="png", video=False)
     copy_clips(root, tmp_path / "out", [(1, (3, 9))])
-    old = LeRobotDataset("local/old", root=root)
-    new = LeRobotDataset("local/new", root=tmp_path / "out")
+    old = load("local/old", root=root)
+    new = load("local/new", root=tmp_path / "out")
     for row in range(6):
         assert bool((new[row][HEAD] == old[12 + 3 + row][HEAD]).all())
     assert new.meta.stats[HEAD]["count"] == [6]
@@ -267,7 +269,7 @@ def test_recording_goes_on_in_it(recorded, tmp_path):
     dataset.finalize()
     teleop.disconnect()
     robot.disconnect()
-    loaded = LeRobotDataset("local/out", root=out)
+    loaded = load("local/out", root=out)
     assert len(loaded) == 18 + 24 + 10
     assert loaded[51]["frame_index"] == 9
     with Source(out) as source:
@@ -314,10 +316,10 @@ def test_pictures_that_are_missing_are_refused(tmp_path):
 
 
 def test_missing_pictures_are_counted():
-    index = VideoIndex(np.array([0, 1, 2, 4, 5]), np.ones(5, bool), time_base=1 / 10)
+    index = VideoIndex(np.array([0, 1, 2, 4, 5]), np.ones(5, bool), time_base=Fraction(1, 10))
     assert index.count_missing(0.0, 6, 10) == 1
     assert index.count_missing(0.4, 4, 10) == 2
-    assert VideoIndex(np.array([]), np.array([]), 1).count_missing(0.0, 3, 10) == 3
+    assert VideoIndex(np.array([]), np.array([]), Fraction(1)).count_missing(0.0, 3, 10) == 3
 
 
 # Merge and split.
@@ -334,7 +336,7 @@ def test_merge(recorded, tmp_path, capsys):
     sources = [row["provenance"][-1]["source"].rpartition("/")[2] for row in read_facts(out)]
     assert sources == ["toy"] * 3 + ["part"]
     names = [str(recorded), str(tmp_path / "part")]
-    datasets = [LeRobotDataset(f"local/{i}", root=name) for i, name in enumerate(names)]
+    datasets = [load(f"local/{i}", root=name) for i, name in enumerate(names)]
     theirs = merge_datasets(datasets, "local/theirs", tmp_path / "theirs")
     for episode in range(4):
         ours, rows = read_rows(out, episode), read_rows(theirs.root, episode)
@@ -347,7 +349,7 @@ def test_merge_numbers_tasks_anew(tmp_path):
     copy_clips(tmp_path / "two", tmp_path / "second", [(1, None)])  # task 1 alone
     roots = [str(tmp_path / name) for name in ("second", "one")]
     assert main(["merge", "--root", *roots, "--out", str(tmp_path / "out")]) == 0
-    dataset = LeRobotDataset("local/out", root=tmp_path / "out")
+    dataset = load("local/out", root=tmp_path / "out")
     assert [dataset[i]["task"] for i in (0, 5, 6, 10)] == ["task 1", "task 1", "task 0", "task 0"]
 
 

@@ -9,8 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from curate_data import compute_digests, make_foreign, rewrite
-from curate_recorded import read_pictures, read_rows, record_toy
-from lerobot.datasets import LeRobotDataset
+from curate_recorded import load, read_pictures, read_rows, record_toy
 
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.facts import read_facts
@@ -96,7 +95,7 @@ def test_rows_and_pictures_stay_together(base, tmp_path):
     assert new["time.sim"].tolist() == old["time.sim"][start:stop].tolist()
     whole = read_pictures(base, 0, HEAD, FPS)
     np.testing.assert_array_equal(read_pictures(out, 0, HEAD, FPS), whole[start:stop])
-    before, after = (LeRobotDataset(f"local/{r.name}", root=r) for r in (base, out))
+    before, after = (load(f"local/{r.name}", root=r) for r in (base, out))
     for row in (0, 1, stop - start - 1):
         assert bool((after[row][HEAD] == before[start + row][HEAD]).all())
 

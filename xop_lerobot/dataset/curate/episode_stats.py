@@ -87,7 +87,7 @@ def compute_stats(columns: Mapping[str, np.ndarray], features: Mapping[str, Any]
         columns: Values by key. Shapes (n, size); size 1 may be (n,).
         features: Features of the dataset.
     """
-    numbers = {
+    numbers: dict[str, Any] = {
         key: values.reshape(len(values)) if tuple(features[key]["shape"]) == (1,) else values
         for key, values in columns.items()
         if features[key]["dtype"] not in ("string", "language", "image", "video")

@@ -20,7 +20,7 @@ Success goes to the facts and to `next.success`. Sub-tasks go to the column `sub
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -188,7 +188,7 @@ class Labeller:
         self._changed: list[int] = []
         self._frames: dict[str, int] = dict.fromkeys(self.names, 0)
 
-    def make_clips(self, *, quiet: bool = True) -> Iterator[Clip]:
+    def make_clips(self, *, quiet: bool = True) -> Generator[Clip]:
         """Make every episode with its labels."""
         from xop_lerobot.dataset.curate.clip import Clip  # noqa: PLC0415
 
@@ -207,7 +207,7 @@ class Labeller:
                     self._frames[self.names[number]] += int(count)
             yield Clip(source, entry, facts=facts, columns=columns)
 
-    def _judge(self) -> Iterator[tuple[EpisodeEntry, bool | None]]:
+    def _judge(self) -> Generator[tuple[EpisodeEntry, bool | None]]:
         if self._success is None:
             for entry in self._source.episodes:
                 yield entry, self._labels.get(entry.index, Label()).success

@@ -17,6 +17,7 @@ from typing import Any
 
 import av
 import numpy as np
+from av.error import FFmpegError
 
 from xop_lerobot.errors import BadDataset
 
@@ -71,7 +72,7 @@ def index_video(root: Path, file: Path) -> VideoIndex:
     Raises:
         BadDataset: If there is no such file, or it is no video.
     """
-    pts, keys = [], []
+    pts, keys, time_base = [], [], Fraction(1, 1)
     try:
         size = (root / file).stat().st_size
         with av.open(str(root / file)) as container:
@@ -87,7 +88,7 @@ def index_video(root: Path, file: Path) -> VideoIndex:
             time_base = stream.time_base or Fraction(1, 1)
     except FileNotFoundError:
         raise BadDataset(root, f"{file} is missing") from None
-    except (av.FFmpegError, OSError, IndexError, ValueError) as error:
+    except (FFmpegError, OSError, IndexError, ValueError) as error:
         raise BadDataset(root, f"{file} is not readable ({_say(error)})") from error
     return VideoIndex(np.array(pts, np.int64), np.array(keys, bool), time_base)
 
@@ -241,7 +242,7 @@ def decode(cut: Cut, fps: float, wanted: set[int]) -> Iterator[tuple[int, np.nda
                     yield number, frame.to_ndarray(format="rgb24")
                 if not left or time > cut.stop - cut.start:
                     return
-    except (av.FFmpegError, OSError, IndexError) as error:
+    except (FFmpegError, OSError, IndexError) as error:
         raise BadDataset(cut.root, f"{cut.file} is not readable ({_say(error)})") from error
 
 

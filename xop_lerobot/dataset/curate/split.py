@@ -169,7 +169,7 @@ def assign(
     taken: dict[int, str] = {}
     total = 0.0
     for name, share in shares.items():
-        if isinstance(share, float):
+        if not isinstance(share, list):
             start = round(total * len(order))
             total += share
             chosen = sorted(order[start : round(total * len(order))])

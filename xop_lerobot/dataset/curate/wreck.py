@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import write_tasks
 
@@ -110,8 +109,9 @@ def _lay_out_rows(
         except CannotSalvage as fault:
             wreck.notes.append(f"{name} is not usable ({fault}): left out")
             continue
-        for index in pc.unique(table["episode_index"]).to_pylist():
-            yield index, (name, table.filter(pc.equal(table["episode_index"], index)))
+        counters = table["episode_index"].to_numpy()
+        for index in table["episode_index"].unique().to_pylist():
+            yield index, (name, table.filter(pa.array(counters == index)))
 
 
 def _read_counters(path: Path) -> pa.Table:
@@ -165,7 +165,7 @@ def _find_tasks(
         wreck.notes.append(f"{_TASKS} is not readable: made anew of what the episodes say")
     tasks: dict[int, str] = {}
     for index, (_, table) in rows.items():
-        numbers = pc.unique(table["task_index"]).to_pylist()
+        numbers = table["task_index"].unique().to_pylist()
         if index in known and len(numbers) == len(known[index].tasks) == 1:
             tasks[numbers[0]] = known[index].tasks[0]
     numbers = sorted({n for _, table in rows.values() for n in table["task_index"].to_pylist()})
