@@ -92,7 +92,7 @@ class Teleoperation:
         self._gestures = GestureReader(config.gestures)
         self._sync = StateSync(self.morphology, model) if config.retargeter.sync else None
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
-        self._arms = ArmDriver(self.morphology)
+        self._arms = ArmDriver(self.morphology, holds_place=self.retargeter.holds_place)
         self._smoother = CommandSmoother(self.morphology.command_space, self.dt)
         self._was_engaged = False
         self._start_over()

@@ -37,10 +37,12 @@ class ArmDriver:
 
     Args:
         morphology: The robot.
+        holds_place: Whether the body is brought to where its goal is (`Retargeter.holds_place`).
     """
 
-    def __init__(self, morphology: Morphology) -> None:
+    def __init__(self, morphology: Morphology, *, holds_place: bool = True) -> None:
         self.morphology = morphology
+        self.holds_place = holds_place
         self.ik = ArmIk(morphology)
         self.bias = ArmBias(self.ik.joint_range, time_constant=BIAS_TIME)
         self._body = SteadyBody(morphology, self.ik.model)
@@ -119,7 +121,7 @@ class ArmDriver:
         walking = goal.mode is Mode.MOBILE
         self.hold.update(self.load.force, goals[right][:3] - goals[left][:3])
         self.giving.update(self.hold.squeeze, dt)
-        if self.hold.is_holding and walking:
+        if not self.holds_place or (self.hold.is_holding and walking):
             # What is carried goes with the body, however far that is from its goal: arms that
             # stretch aside shear what is between them.
             wrists = compute_wrist_goals(goals, head, max_offset=0.0, max_turn=0.0)

@@ -41,6 +41,8 @@ class DirectRetargeter(Retargeter):
         control_hz: Plans per second of the robot's clock [Hz].
     """
 
+    holds_place = False
+
     def __init__(
         self, morphology: Morphology, model: mujoco.MjModel, control_hz: float = 25.0
     ) -> None:

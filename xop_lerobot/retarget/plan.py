@@ -62,10 +62,14 @@ class Retargeter(ABC):
     Attributes:
         cost_names: Names of the cost terms of its plans, in order.
         frames: The tracked frames it drives; the arms' inverse kinematics follow the others.
+        holds_place: Whether it brings the head back to its goal's place. Of one that does not,
+            arms go with the head: the place of their goals in the world is lost with the first
+            step.
     """
 
     cost_names: tuple[str, ...] = ()
     frames: tuple[str, ...] = ("head",)
+    holds_place: bool = True
 
     @abstractmethod
     def reset(self, state: RobotState) -> None:
