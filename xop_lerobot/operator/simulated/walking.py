@@ -31,8 +31,8 @@ STRAIN = (0.06, 0.2)
 LADEN = 0.5
 """Factor on the speed of who carries something."""
 AIM_BEYOND, MOST_BEYOND = 0.5, 0.4
-"""Share of what was left of a leg that the next one is aimed beyond the place, and the most of it [m]:
-people get used to a robot that always ends up on the same side."""
+"""Share of what was left of a leg that the next one is aimed beyond the place, and the most of it
+[m]: people get used to a robot that always ends up on the same side."""
 TURN_FIRST = 0.35
 """Angle up to which a person sets out without turning first [rad]."""
 
@@ -99,7 +99,8 @@ def go_to(
     """Walk until the robot's head is at a place, x y yaw of the robot's world.
 
     Each leg is walked as planned, then the person stops and looks; what is left is the next
-    leg, aimed a little beyond the place by what was left of the legs before. After `tries` legs it has to do.
+    leg, aimed a little beyond the place by what was left of the legs before. After `tries` legs
+    it has to do.
 
     Args:
         mind: Who goes.
