@@ -24,7 +24,8 @@ def compute_facing(heading: float, velocity: np.ndarray, look: float, speed: flo
 
     for driving forwards (+) and backwards (-), with u the velocity that takes the axle to where
     it will be when the robot stands straight at its goal, and :math:`\psi_g` where the goal
-    looks; of the two that with less of a turn and less of a twist is taken. Far from its goal
+    looks; of the two that with less of a turn and less of a twist is taken, and none that twists
+    the waist further than it can: who walks ahead is never followed backwards. Far from its goal
     the base lines up with the way there, near it with the goal, so that driving on closes in on
     the line through the goal, as in parking (path following of a unicycle; Siciliano et al.,
     Robotics, 2009, section 11.6). The last centimetres are left to the waist.
