@@ -30,9 +30,10 @@ STRAIN = (0.06, 0.2)
 """Difference of height [m] and of tilt [rad] to the own head from which a robot strains."""
 LADEN = 0.5
 """Factor on the speed of who carries something."""
-AIM_BEYOND, MOST_BEYOND = 0.5, 0.4
-"""Share of what was left of a leg that the next one is aimed beyond the place, and the most of it
-[m]: people get used to a robot that always ends up on the same side."""
+FALLS_SHORT, AIM_BEYOND, MOST_BEYOND = 0.12, 0.5, 0.4
+"""From which distance on a leg has missed its place [m]; share of it that the next one is aimed
+beyond, if two have missed it to the same side, and the most of it [m]: people get used to a robot
+that always falls short."""
 TURN_FIRST = 0.35
 """Angle up to which a person sets out without turning first [rad]."""
 
@@ -99,8 +100,8 @@ def go_to(
     """Walk until the robot's head is at a place, x y yaw of the robot's world.
 
     Each leg is walked as planned, then the person stops and looks; what is left is the next
-    leg, aimed a little beyond the place by what was left of the legs before. After `tries` legs
-    it has to do.
+    leg, aimed beyond the place when legs fall short of it again and again. After `tries` legs it
+    has to do.
 
     Args:
         mind: Who goes.
@@ -114,7 +115,7 @@ def go_to(
     near = person.place_tolerance if tolerance is None else tolerance
     hands = relaxed_hands(person.size) if hands is None else hands
     yield from mind.settle()
-    stuck, ahead = 0, np.zeros(2)
+    stuck, left, ahead = 0, np.zeros(2), np.zeros(2)
     for leg in range(tries):
         miss, turn = compute_miss(mind, place)
         if leg >= LENIENT[0]:
@@ -123,8 +124,9 @@ def go_to(
             return
         own, seen, turn_then = mind.body.posture.place, mind.eyes.pose("head"), mind.belief.turn
         mind.note(f"leg {leg}: {100 * miss:.0f} cm, {np.degrees(turn):.0f}° to go")
-        if leg:
-            ahead += AIM_BEYOND * (place[:2] - mind.eyes.pose("head")[:2])
+        last, left = left, place[:2] - mind.eyes.pose("head")[:2]
+        if leg > 1 and miss > FALLS_SHORT and left @ last > 0:
+            ahead += AIM_BEYOND * left
             ahead *= min(1.0, MOST_BEYOND / max(float(np.linalg.norm(ahead)), 1e-9))
         aim = place + np.array([*ahead, 0.0])
         target = mind.belief.place_to_own(aim)
