@@ -36,10 +36,11 @@ SHOWN = (
     "dropped_frames", "plan_age_p95", "idle_time", "robot", "task",
 )  # fmt: skip
 """Columns of the table, unless others are asked for."""
-_SUMMARISED = (
+SUMMARISED = (
     "duration", "tracking_mean", "tracking_p95", "tracking_angle_mean", "command_roughness",
     "command_ldlj", "hand_jerk", "plan_age_p95",
 )  # fmt: skip
+"""Numbers whose mean and range are told in the end."""
 _STANDARD_OUTPUT = "-"
 
 
@@ -68,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     shown = parse_names(arguments.show)
     to_output = arguments.json == _STANDARD_OUTPUT
-    table, totals, faults = Table(shown), Totals(_SUMMARISED), list[str]()
+    table, totals, faults = Table(shown), Totals(SUMMARISED), list[str]()
     with Source(arguments.root) as source, _open_list(arguments.json) as write:
         if not to_output:
             print(table.head)

@@ -92,7 +92,8 @@ def _make_morphology(name: str) -> Morphology:
     return make_morphology(name)
 
 
-def _has(features: Features, name: str, size: int | None = None) -> bool:
+def has_column(features: Features, name: str, size: int | None = None) -> bool:
+    """Whether there is a column of numbers or flags, of `size` entries if that is given."""
     feature = features.get(name)
     if feature is None or feature["dtype"] in ("video", "image", "string"):
         return False
@@ -101,7 +102,7 @@ def _has(features: Features, name: str, size: int | None = None) -> bool:
 
 def _need(*columns: str) -> Callable[[Features, EpisodeEntry], tuple[str, ...] | None]:
     def find(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
-        return columns if all(_has(features, column) for column in columns) else None
+        return columns if all(has_column(features, column) for column in columns) else None
 
     return find
 
@@ -109,7 +110,7 @@ def _need(*columns: str) -> Callable[[Features, EpisodeEntry], tuple[str, ...] |
 def _with_engaged(features: Features, columns: list[str]) -> tuple[str, ...] | None:
     if not columns:
         return None
-    return (*columns, ENGAGED) if _has(features, ENGAGED, 1) else tuple(columns)
+    return (*columns, ENGAGED) if has_column(features, ENGAGED, 1) else tuple(columns)
 
 
 # Outcome, where the facts do not say.
@@ -118,7 +119,7 @@ def _with_engaged(features: Features, columns: list[str]) -> tuple[str, ...] | N
 def _find_success(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
     if isinstance(entry.facts.get("success"), bool):
         return ()
-    return ("next.success",) if _has(features, "next.success", 1) else None
+    return ("next.success",) if has_column(features, "next.success", 1) else None
 
 
 def _compute_success(episode: Episode) -> Values:
@@ -131,7 +132,7 @@ def _compute_success(episode: Episode) -> Values:
 def _find_fall(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
     if isinstance(entry.facts.get("fallen"), bool):
         return ()
-    return (BASE,) if _has(features, BASE, _POSE_SIZE) else None
+    return (BASE,) if has_column(features, BASE, _POSE_SIZE) else None
 
 
 def _compute_fall(episode: Episode) -> Values:
@@ -151,7 +152,7 @@ def _list_pairs(features: Features) -> list[str]:
     return [
         frame
         for frame in FRAMES
-        if all(_has(features, f"{kind}.{frame}", _POSE_SIZE) for kind in ("goal", "robot"))
+        if all(has_column(features, f"{kind}.{frame}", _POSE_SIZE) for kind in ("goal", "robot"))
     ]
 
 
@@ -181,7 +182,7 @@ def _compute_tracking(episode: Episode) -> Values:
 
 
 def _find_command(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
-    shape = features[ACTION]["shape"] if _has(features, ACTION) else []
+    shape = features[ACTION]["shape"] if has_column(features, ACTION) else []
     return _with_engaged(features, [ACTION] if len(shape) == 1 else [])
 
 
@@ -210,7 +211,9 @@ def _scale(action: np.ndarray) -> np.ndarray:
 
 
 def _find_hands(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
-    hands = [f"robot.{name}" for name in FRAMES[1:] if _has(features, f"robot.{name}", _POSE_SIZE)]
+    hands = [
+        f"robot.{name}" for name in FRAMES[1:] if has_column(features, f"robot.{name}", _POSE_SIZE)
+    ]
     return _with_engaged(features, hands)
 
 
@@ -240,7 +243,7 @@ def _compute_gaps(episode: Episode) -> Values:
 def _find_late(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
     # In lock-step the host's clock means nothing: frames take what the machine takes for them.
     is_realtime = entry.facts.get("clock") == "realtime"
-    return ("time.wall",) if is_realtime and _has(features, "time.wall", 1) else None
+    return ("time.wall",) if is_realtime and has_column(features, "time.wall", 1) else None
 
 
 def _compute_late(episode: Episode) -> Values:
@@ -273,7 +276,7 @@ def _find_idle(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | Non
     poses = (
         [f"operator.{frame}" for frame in FRAMES] + [BASE] + [f"robot.{name}" for name in FRAMES]
     )
-    if all(_has(features, name, _POSE_SIZE) for name in poses):
+    if all(has_column(features, name, _POSE_SIZE) for name in poses):
         return _with_engaged(features, poses)
     return _find_command(features, entry)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -108,13 +108,15 @@ class Source:
         self.check(wanted)
         return self._rows.read(entry, wanted)
 
-    def read_table(self, entry: EpisodeEntry) -> pa.Table:
-        """Read all columns of an episode as they are in its file, pictures included.
+    def read_table(self, entry: EpisodeEntry, columns: Sequence[str] = ()) -> pa.Table:
+        """Read columns of an episode as they are in its file, all without `columns`.
+
+        Pictures can be read so.
 
         Raises:
             BadDataset: If the file is malformed, or does not hold the whole episode.
         """
-        return self._rows.read_table(entry)
+        return self._rows.read_table(entry, columns)
 
     def check_rows(self, entry: EpisodeEntry) -> None:
         """Check that the columns of an episode's file are as announced, without reading them.

@@ -50,6 +50,7 @@ def survey(
     source: Source,
     names: Collection[str] = tuple(FIGURES),
     note: Callable[[str], None] | None = None,
+    episodes: Collection[int] | None = None,
 ) -> Iterator[Finding]:
     """Find the figures of each episode in order; what is not asked for is not read.
 
@@ -59,6 +60,7 @@ def survey(
         source: The dataset.
         names: Names of the figures.
         note: Told of files of metadata that cannot be read; None makes them an error.
+        episodes: Indices of the episodes; all if None.
 
     Raises:
         BadDataset: If the metadata is missing or malformed.
@@ -67,6 +69,8 @@ def survey(
     measures = [each for each in MEASURES if not set(wanted).isdisjoint(each.figures)]
     videos = VideoCheck(source) if "readable" in names else None
     for entry in source.iterate(note):
+        if episodes is not None and entry.index not in episodes:
+            continue
         problems: list[str] = []
         values = _read_facts(source, entry, problems)
         values |= _measure(source, entry, measures, problems, read_all="readable" in names)

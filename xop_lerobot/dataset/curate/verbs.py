@@ -29,6 +29,7 @@ VERBS = {
     "repair": "repair",
     "label": "label",
     "retarget": "retarget",
+    "report": "report",
 }
 """Module of each verb, in the order of the list."""
 
