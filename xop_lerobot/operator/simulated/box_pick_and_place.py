@@ -60,6 +60,12 @@ WALK_NEAR = 0.06
 """How far beside its spot the box may be when one has walked there; the hands do the rest [m]."""
 PLACE_NEAR = 0.04
 """How far beside the spot the box may be put down [m]."""
+OPENINGS, DONE_S = 3, 2.5
+"""How often a person takes the hands farther off a box, and how long they look whether it counts
+[s]."""
+LOWERINGS, BY_KNEES, KNEES_SPEED = 6, 0.03, 0.08
+"""How often a person lowers a box before letting it go anyway, from what height on it bends the
+knees for it [m], and how fast [m/s]."""
 LEVEL, LEVELLINGS, TIP_SPEED = 0.08, 3, 0.15
 """Tilt at which a box is level enough to be put down [rad], how often a person tips it, and how
 fast [rad/s]."""
@@ -197,26 +203,51 @@ def put_down(mind: Mind) -> Doing:
     for _ in range(4):
         yield from mind.settle("left_palm", "right_palm")
         check_held(mind)
-        error = (mind.eyes.pose("spot") - mind.eyes.pose("box"))[:3]
-        error[2] = 0
-        off = float(np.linalg.norm(error))
-        mind.note(f"box {100 * off:.1f} cm beside the spot")
-        if off <= PLACE_NEAR:
+        error = compute_way_to_spot(mind)
+        if np.linalg.norm(error) <= PLACE_NEAR:
             break
         yield from shift_hands(mind, mind.person.hand_gain * error, CARRY_SPEED)
     yield from level(mind)
-    for _ in range(4):
+    for _ in range(LOWERINGS):
         yield from mind.settle("left_palm", "right_palm")
         check_held(mind)
         height = compute_height_over_spot(mind)
         mind.note(f"box {100 * height:.1f} cm over the table")
         if height < 0.012:  # noqa: PLR2004
             break
-        yield from shift_hands(mind, np.array([0, 0, -height - 0.01]), CARRY_SPEED)
+        if height > BY_KNEES:
+            yield from bend_knees(mind, height)
+            continue
+        # Arms that go down draw nearer, too.
+        way = mind.person.hand_gain * compute_way_to_spot(mind)
+        way[2] = -height - 0.01
+        yield from shift_hands(mind, way, CARRY_SPEED)
     mind.note("let go")
     yield from open_hands(mind)
     yield from shift_hands(mind, np.array([0, 0, 0.05]), 2 * CARRY_SPEED)
-    yield from mind.pause(3.0)
+    for _ in range(OPENINGS):
+        yield from mind.pause(DONE_S)
+        if mind.eyes.success:
+            return
+        mind.note("a hand still touches it")
+        yield from open_hands(mind)
+
+
+def bend_knees(mind: Mind, way: float) -> Doing:
+    """Go down with all that one holds, by so much of the robot's height [m]."""
+    last = mind.body.posture
+    drop = min(last.drop + way / mind.belief.scale, mind.person.leg_bend)
+    mind.note(f"bend the knees by {100 * (drop - last.drop):.0f} cm")
+    mind.body.move(replace(last, drop=drop), max(1.0, (drop - last.drop) / KNEES_SPEED))
+    yield from mind.finish()
+
+
+def compute_way_to_spot(mind: Mind) -> np.ndarray:
+    """Way of the box to above its spot, level [m]. Shape (3,)."""
+    way = (mind.eyes.pose("spot") - mind.eyes.pose("box"))[:3]
+    way[2] = 0
+    mind.note(f"box {100 * float(np.linalg.norm(way)):.1f} cm beside the spot")
+    return way
 
 
 def level(mind: Mind) -> Doing:
