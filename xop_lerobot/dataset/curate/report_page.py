@@ -57,12 +57,15 @@ class Report:
         self._unknown = set(FIGURES)
         self._shown = self.episodes = self.faulty = 0
         self._files = ExitStack()
+        self._made: list[Path] = []
         self._rows: IO[str]
         self._sections: IO[str]
 
     def __enter__(self) -> Self:
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
+            for folder in reversed(self._find_missing_folders()):
+                folder.mkdir()
+                self._made.append(folder)
             # Beside the page, where there must be room for it anyway.
             self._rows, self._sections = (
                 self._files.enter_context(
@@ -71,7 +74,7 @@ class Report:
                 for _ in range(2)
             )
         except OSError as error:
-            self._files.close()
+            self._clean_up()
             raise XopError(f"'{self._path}' cannot be written: {error}") from error
         return self
 
@@ -81,8 +84,19 @@ class Report:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._clean_up()
+
+    def _find_missing_folders(self) -> list[Path]:
+        return [each for each in self._path.parents if not each.exists()]
+
+    def _clean_up(self) -> None:
+        """Leave the page behind, or nothing."""
         self._files.close()
-        self._draft.unlink(missing_ok=True)
+        if self._draft.is_file():
+            self._draft.unlink()
+        for folder in reversed(self._made):
+            if not any(folder.iterdir()):
+                folder.rmdir()
 
     def add(self, finding: Finding) -> None:
         """Add an episode."""

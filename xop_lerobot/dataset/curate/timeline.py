@@ -5,6 +5,7 @@ Each part takes the columns that it needs; what a dataset has not, is left out a
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,7 @@ _COST, _COMMAND, _STATE, _PINCH = (
     "retargeter.cost", "retargeter.command", "observation.state", "operator.pinch",
 )  # fmt: skip
 _MODE = "mode.pos"
+_NUMBERS = r"(bool|u?int|float)"
 
 
 class Series(NamedTuple):
@@ -104,7 +106,18 @@ class Part(NamedTuple):
 
 
 def _present(features: Features, *columns: tuple[str, int | None]) -> list[str]:
-    return [name for name, size in columns if has_column(features, name, size)]
+    return [
+        name
+        for name, size in columns
+        if has_column(features, name, size) and re.match(_NUMBERS, features[name]["dtype"])
+    ]
+
+
+def _get_names(episode: Episode, column: str) -> list[str]:
+    """Names of a column's entries, as far as there are entries; empty if it is not there."""
+    if column not in episode.rows:
+        return []
+    return episode.get_names(column)[: episode.rows[column].shape[1]]
 
 
 def _make_band(name: str, kind: str, flags: np.ndarray) -> Band:
@@ -127,7 +140,7 @@ def _build_states(episode: Episode) -> list[Band]:
     rows, bands = episode.rows, []
     if ENGAGED in rows:
         bands.append(_make_band("engaged", "good", rows[ENGAGED][:, 0]))
-    action_names = episode.get_names(ACTION) if ACTION in rows else []
+    action_names = _get_names(episode, ACTION)
     if _MODE in action_names:
         mode = rows[ACTION][:, action_names.index(_MODE)]
         bands.append(_make_band("mobile", "plain", mode > 0.5))
@@ -135,7 +148,7 @@ def _build_states(episode: Episode) -> list[Band]:
         for index, frame in enumerate(FRAMES):
             lost = quality.find_gaps(rows[TRACKED][:, index : index + 1], episode.engaged)
             bands.append(_make_band(f"{frame.replace('_', ' ')} lost", "bad", lost))
-    names = episode.get_names(HEALTH) if HEALTH in rows else []
+    names = _get_names(episode, HEALTH)
     if "status" in names:
         status = rows[HEALTH][:, names.index("status")]
         bands.append(_make_band("unsolved", "bad", (status != 0) & episode.engaged))
@@ -242,7 +255,7 @@ def _build_command(episode: Episode) -> list[Panel]:
     rows = episode.rows
     morphology = find_morphology(episode.robot)
     dims = () if morphology is None else morphology.command_space.dims
-    names = {name: episode.get_names(name) for name in rows}
+    names = {name: _get_names(episode, name) for name in rows}
     if ACTION in rows and dims and all(dim.key in names[ACTION] for dim in dims):
         panels = []
         for dim in dims:
@@ -270,9 +283,9 @@ def _find_cost(features: Features, entry: EpisodeEntry) -> list[str]:
 
 
 def _build_cost(episode: Episode) -> list[Panel]:
-    rows, names = episode.rows[_COST], episode.get_names(_COST)
+    rows, names = episode.rows[_COST], _get_names(episode, _COST)
     # A term that a retargeter does not have is 0 throughout.
-    places = [i for i, name in enumerate(names[: rows.shape[1]]) if rows[:, i].any()]
+    places = [i for i, name in enumerate(names) if rows[:, i].any()]
     known = rows.any(axis=1)  # before engaging there is no plan
     curves = [
         Series(names[place], _mask(rows[:, place], known), colour=number)
@@ -294,7 +307,7 @@ def _find_plan(features: Features, entry: EpisodeEntry) -> list[str]:
 
 
 def _build_plan(episode: Episode) -> list[Panel]:
-    rows, names = episode.rows[HEALTH], episode.get_names(HEALTH)
+    rows, names = episode.rows[HEALTH], _get_names(episode, HEALTH)
     panels = []
     for title, unit, wanted in _PLAN:
         curves = [

@@ -28,17 +28,18 @@ function draw(kind, attributes = {}, text = "") {
 function format(value, figure) {
   if (value === null) return "-";
   if (typeof value === "boolean") return value ? "yes" : "no";
-  if (typeof value !== "number" || Number.isInteger(value)) return String(value);
+  if (typeof value !== "number" || (Number.isInteger(value) && !figure.unit)) return String(value);
   const digits = /^(plan|solve)/.test(figure.name) ? 3 : { m: 3, rad: 2, s: 1 }[figure.unit] ?? 1;
   return value.toFixed(digits);
 }
 
-const short = (value) => {
+function short(value, span = 0) {
   const size = Math.abs(value);
-  if (value === 0) return "0";
+  if (size <= span * 1e-3) return "0"; // as good as 0 beside the range of the axis
   if (size >= 1e6 || size < 1e-4) return value.toExponential(1);
+  if (span > 1e-3 && span < 10) return String(Number(value.toFixed(Math.ceil(2 - Math.log10(span)))));
   return String(Number(value.toPrecision(3)));
-};
+}
 
 // Table.
 
@@ -135,14 +136,15 @@ function goTo(row) {
 function range(values) {
   let low = Infinity, high = -Infinity;
   for (const value of values) { low = Math.min(low, value); high = Math.max(high, value); }
+  if (low === high && low === 0) return [0, 1];
   if (low === high) { const pad = Math.abs(low) * 0.1 || 1; return [low - pad, high + pad]; }
   return [low, high];
 }
 
 function makeAxes(svg, box, [low, high], side) {
   const text = { class: "tick" };
-  for (const share of [0, 0.5, 1]) {
-    const value = short(low + share * (high - low));
+  for (const share of side === "up" ? [0, 0.5, 1] : [0, 1]) {
+    const value = short(low + share * (high - low), high - low);
     if (side === "up") {
       const y = box.bottom + share * (box.top - box.bottom);
       svg.append(draw("line", { class: "grid", x1: box.left, x2: box.right, y1: y, y2: y }),
@@ -198,7 +200,7 @@ function plot(xName, yName, width, height, bars) {
     const most = Math.max(...counts), step = (box.bottom - box.top) / BINS;
     counts.forEach((count, i) => svg.append(draw("rect", { class: "bar", x: box.right + 8,
       y: box.bottom - (i + 1) * step + 0.5, width: 50 * count / most, height: step - 1 })));
-    svg.append(draw("text", { x: width - 4, y: box.bottom + 14, "text-anchor": "end" }, `${most}`));
+    svg.append(draw("text", { x: width - 4, y: box.bottom + 14, "text-anchor": "end" }, `max ${most}`));
   }
   const shown = thinOut(all);
   for (const { row, x, y } of shown) {
@@ -218,7 +220,7 @@ function plot(xName, yName, width, height, bars) {
 }
 
 function showScatter() {
-  find("scatter").replaceChildren(plot(find("plot-x").value, find("plot-y").value, 640, 380, false));
+  find("scatter").replaceChildren(plot(find("plot-x").value, find("plot-y").value, 640, 320, false));
 }
 
 // Timelines of an episode.
@@ -243,6 +245,7 @@ function fit(canvas, height) {
   return { pen, width, height };
 }
 
+const LEAST_SPAN = { m: 0.05, rad: 0.05 };
 const PANEL = { height: 110, left: 42, right: 6, top: 6, bottom: 14 };
 
 class Timeline {
@@ -282,6 +285,10 @@ class Timeline {
       const curves = panel.series.map((series) => ({ ...series, values: decode(series) }));
       const known = curves.filter((curve) => curve.values.some(Number.isFinite));
       let [low, high] = known.length ? range(known.flatMap((curve) => [curve.lo, curve.hi])) : [0, 1];
+      const least = LEAST_SPAN[panel.unit] ?? 0, middle = (low + high) / 2;
+      if (high - low < least && known.length) { // a tremble is not to fill the panel
+        [low, high] = low === 0 ? [0, least] : [middle - least / 2, middle + least / 2];
+      }
       const marks = curves.map((curve) => {
         const mark = make("b");
         const name = make("span", { textContent: `${curve.style === "goal" ? "┄" : "—"} ${curve.name} ` });
@@ -380,7 +387,7 @@ class Timeline {
       pen.lineTo(right, toY(value));
       pen.stroke();
       pen.textAlign = "right";
-      pen.fillText(short(value), PANEL.left - 3, toY(value) + 3);
+      pen.fillText(short(value, high - low), PANEL.left - 3, toY(value) + 3);
       pen.textAlign = share === 0 ? "left" : share === 1 ? "right" : "center";
       pen.fillText(`${short(share * this.duration)} s`, toX(share * this.duration), height - 3);
     }
@@ -412,7 +419,8 @@ class Timeline {
 fill(find("choice"), Object.keys(CHOICES), table.choice);
 fill(find("sort"), names, table.sort);
 fill(find("plot-x"), numbers, numbers.includes("duration") ? "duration" : numbers[0]);
-fill(find("plot-y"), numbers, PLOTTED.includes("tracking_p95") ? "tracking_p95" : numbers[0]);
+fill(find("plot-y"), numbers, PLOTTED.includes("tracking_p95") ? "tracking_p95"
+  : PLOTTED.at(-1) ?? numbers[0]);
 find("choice").addEventListener("change", (event) => { table.choice = event.target.value; showTable(); });
 find("sort").addEventListener("change", (event) => sortBy(event.target.value, table.descending));
 find("descending").addEventListener("change", (event) => sortBy(table.sort, event.target.checked));

@@ -1,0 +1,356 @@
+"""`xop-curate report`: the page in a real browser, partial data, and how it is written."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from browser import open_page
+from curate_data import compute_digests, make_foreign, make_synthetic, rewrite
+
+from xop_lerobot.dataset.curate.cli import main
+from xop_lerobot.dataset.curate.figures import FIGURES
+from xop_lerobot.dataset.curate.report_episode import Limits
+from xop_lerobot.dataset.curate.report_page import Report
+from xop_lerobot.dataset.curate.source import Source
+from xop_lerobot.dataset.curate.survey import survey
+from xop_lerobot.dataset.curate.traces import decode, encode, thin
+from xop_lerobot.dataset.facts import EPISODES_FILE
+from xop_lerobot.page import dump_script
+
+EPISODES, FRAMES = 6, 100
+EVIL = "</script><img src=x onerror=\"document.title='evil'\">"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    return make_synthetic(tmp_path_factory.mktemp("made") / "data", EPISODES, FRAMES)
+
+
+@pytest.fixture(scope="module")
+def foreign(tmp_path_factory) -> Path:
+    return make_foreign(tmp_path_factory.mktemp("foreign") / "data")
+
+
+@pytest.fixture(scope="module")
+def page_file(made, tmp_path_factory) -> Path:
+    """The page of a dataset of this project's columns, one of whose tasks means harm."""
+    folder = tmp_path_factory.mktemp("page")
+    root = Path(shutil.copytree(made, folder / "data"))
+    lines = [json.loads(line) for line in (root / EPISODES_FILE).read_text().splitlines()]
+    lines[0]["changes"] = [{"frame": 50, "time": 2.0, "source": "user", "change": EVIL}]
+    lines[0]["subtasks"] = [["reach", 0, 40], ["lift", 40, 100]]
+    (root / EPISODES_FILE).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    tracked = np.ones((FRAMES, 3), bool)
+    tracked[20:45, 1] = False
+    path = root / "data/chunk-000/file-001.parquet"
+    flat = pa.array(tracked.reshape(-1))
+    kind = pq.read_schema(path).field("operator.tracked").type
+    rewrite(path, {"operator.tracked": pa.FixedSizeListArray.from_arrays(flat, 3).cast(kind)})
+    assert main(["report", "--root", str(root), "--out", str(folder / "page.html")]) == 0
+    return folder / "page.html"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from browser import launch
+
+    with launch() as started:
+        yield started
+
+
+@pytest.fixture
+def page(browser, page_file):
+    with open_page(browser, page_file) as opened:
+        yield opened
+
+
+def read_figures(path: Path) -> dict:
+    """The data of the table."""
+    text = path.read_text()
+    found = re.search(r'<script type="application/json" id="figures">(.*?)</script>', text, re.S)
+    assert found
+    return json.loads(found[1])
+
+
+def read_timelines(path: Path) -> list[dict]:
+    text = path.read_text()
+    pattern = r'<div class="timeline"></div><script type="application/json">(.*?)</script>'
+    return [json.loads(found) for found in re.findall(pattern, text, re.S)]
+
+
+# In a browser.
+
+
+def read_column(page, name: str) -> list[str]:
+    places = page.locator("#table th").evaluate_all("cells => cells.map((c) => c.dataset.name)")
+    cells = page.locator(f"#table tbody tr td:nth-child({places.index(name) + 1})")
+    return cells.all_inner_texts()
+
+
+def test_the_page_runs_and_fetches_nothing(page, page_file):
+    assert page.title() == "Dataset data"
+    page.locator("#episode-5").scroll_into_view_if_needed()
+    page.wait_for_selector("#episode-5 canvas")
+    assert page.problems == []
+    assert page.requests == [page_file.as_uri()]
+
+
+def test_the_table_sorts_by_any_figure(page, page_file):
+    assert read_column(page, "episode") == [str(index) for index in range(EPISODES)]
+    data = read_figures(page_file)
+    place = list(FIGURES).index("tracking_p95")
+    ranked = sorted(data["rows"], key=lambda row: row[0][place])
+    ranked = [str(row[0][0]) for row in ranked]
+    head = page.locator('#table th[data-name="tracking_p95"]')
+    head.locator("button").click()
+    assert read_column(page, "episode") == ranked
+    assert head.get_attribute("aria-sort") == "ascending"
+    head.locator("button").click()
+    assert read_column(page, "episode") == ranked[::-1]
+    assert head.get_attribute("aria-sort") == "descending"
+    # One that is not among the columns gets there by being chosen; what is unknown comes last.
+    for figure in FIGURES:
+        page.select_option("#sort", figure)
+        values = read_column(page, figure)
+        assert len(values) == EPISODES
+        assert values == sorted(values, key=lambda text: text == "-")
+    page.check("#all")
+    assert page.locator("#table th").count() == len(FIGURES)
+
+
+def test_the_table_leads_to_episodes_and_back(page):
+    page.locator("#table tbody a", has_text="4").click()
+    section = page.locator("#episode-4")
+    page.wait_for_function("document.querySelector('#episode-4').getBoundingClientRect().top < 200")
+    assert section.locator("h3").inner_text().startswith("Episode 4")
+    section.locator("a.up").click()
+    page.wait_for_function("document.querySelector('#episodes').getBoundingClientRect().top >= -1")
+    assert page.url.endswith("#episodes")
+
+
+def test_the_table_shows_a_choice(page, page_file):
+    place = list(FIGURES).index("success")
+    failed = [row[0][0] for row in read_figures(page_file)["rows"] if row[0][place] is False]
+    page.select_option("#choice", "no success")
+    assert read_column(page, "episode") == list(map(str, failed))
+    assert page.inner_text("#count") == f"{len(failed)} of {EPISODES} episodes"
+
+
+def test_plots_have_a_point_an_episode_and_lead_there(page):
+    plots = page.locator("#plots svg")
+    assert plots.count() >= 8
+    for index in range(plots.count()):
+        assert plots.nth(index).locator("circle").count() == EPISODES
+        assert plots.nth(index).locator("rect.bar").count() == 20
+    plots.first.locator('circle[data-episode="2"]').click()
+    assert page.url.endswith("#episode-2")
+    page.select_option("#plot-x", "tracking_mean")
+    page.select_option("#plot-y", "hand_jerk")
+    label = page.locator("#scatter svg").get_attribute("aria-label")
+    assert label == "hand_jerk over tracking_mean"
+
+
+def test_timelines_are_drawn_and_tell_values(page, page_file):
+    section = page.locator("#episode-1")
+    section.scroll_into_view_if_needed()
+    page.wait_for_selector("#episode-1 canvas")
+    titles = section.locator(".timeline h4").all_text_contents()
+    assert titles == ["Operator", "Goal and robot", "Command", "Cost by term", "Planner"]
+    page.wait_for_timeout(200)
+    # Something is drawn on every canvas.
+    blank = """canvases => canvases.filter((c) => !c.width || !c.getContext("2d")
+        .getImageData(0, 0, c.width, c.height).data.some((v) => v)).length"""
+    canvases = section.locator("canvas")
+    assert canvases.count() > 20
+    assert canvases.evaluate_all(blank) == 0
+    # At the middle of a panel, the legend tells the value there.
+    panel = section.locator(".panel", has_text="head z [m]").first
+    panel.scroll_into_view_if_needed()
+    width = panel.locator("canvas").evaluate("canvas => canvas.clientWidth")
+    panel.locator("canvas").hover(position={"x": 42 + (width - 48) / 2 + 1, "y": 50})
+    value = panel.locator(".legend span", has_text="goal").locator("b")
+    expect = "(mark) => mark.textContent"
+    page.wait_for_function(expect, arg=value.element_handle())
+    told = float(value.text_content())
+    root = page_file.parent / "data"
+    with Source(root) as source:
+        rows = source.read(list(source.episodes)[1], ["goal.head"])["goal.head"]
+    assert told == pytest.approx(rows[FRAMES // 2 - 1 : FRAMES // 2 + 2, 2].mean(), abs=0.02)
+
+
+def test_what_means_harm_is_text(page):
+    page.locator("#episode-0").scroll_into_view_if_needed()
+    page.wait_for_selector("#episode-0 canvas")
+    assert page.title() == "Dataset data"
+    assert page.problems == []
+
+
+def test_pictures_and_a_partial_result_of_a_foreign_dataset(browser, foreign, tmp_path, capsys):
+    path = tmp_path / "page.html"
+    assert main(["report", "--root", str(foreign), "--out", str(path), "--pictures", "5"]) == 0
+    assert (
+        "left out, for want of columns: operator (no operator.head, …)" in capsys.readouterr().out
+    )
+    with open_page(browser, path) as page:
+        assert "this dataset lacks columns" in page.inner_text("#missing")
+        assert page.locator("#episode-0 .strip img").count() == 5
+        sizes = page.locator(".strip img").evaluate_all("all => all.map((i) => i.naturalWidth)")
+        assert sizes == [32] * 10
+        section = page.locator("#episode-0")
+        section.scroll_into_view_if_needed()
+        page.wait_for_selector("#episode-0 canvas")
+        assert section.locator(".timeline h4").all_text_contents() == ["Command"]
+        section.locator("figure").nth(2).click()
+        assert section.locator(".clock").inner_text() == "1.40 s"
+        assert section.locator("figure.near").count() == 1
+        assert page.problems == []
+
+
+# Without a browser.
+
+
+def test_timelines_hold_the_columns(page_file):
+    root = page_file.parent / "data"
+    timeline = read_timelines(page_file)[1]
+    groups = {group["title"]: group["panels"] for group in timeline["groups"]}
+    with Source(root) as source:
+        entry = list(source.episodes)[1]
+        rows = source.read(entry, ["goal.head", "robot.head", "retargeter.cost", "operator.head"])
+    head = next(panel for panel in groups["Goal and robot"] if panel["title"] == "head x")
+    for series, column in zip(head["series"], ("goal.head", "robot.head"), strict=True):
+        np.testing.assert_allclose(decode(series), rows[column][:, 0], atol=1e-4)
+    names = [series["name"] for series in groups["Cost by term"][0]["series"]]
+    assert "tracking" in names
+    bands = {band["name"]: band["runs"] for band in timeline["bands"]}
+    assert bands["left wrist lost"] == [[0.8, 1.8, ""]]
+    assert bands["head lost"] == []
+    bands = {band["name"]: band["runs"] for band in read_timelines(page_file)[0]["bands"]}
+    assert bands["sub-tasks"] == [[0.0, 1.6, "reach"], [1.6, 4.0, "lift"]]
+
+
+def test_what_is_said_is_what_inspect_says(page_file):
+    data = read_figures(page_file)
+    assert [figure["name"] for figure in data["figures"]] == list(FIGURES)
+    with Source(page_file.parent / "data") as source:
+        for row, finding in zip(data["rows"], survey(source), strict=True):
+            for value, expected in zip(row[0], finding.figures.values(), strict=True):
+                assert value == (pytest.approx(expected) if expected is not None else None)
+
+
+def test_a_chosen_part(made, tmp_path, capsys):
+    path = tmp_path / "page.html"
+    flags = ["--root", str(made), "--out", str(path), "--quiet"]
+    assert main(["report", *flags, "--episodes", "1,3-5", "--detailed", "2"]) == 0
+    text = path.read_text()
+    assert [row[0][0] for row in read_figures(path)["rows"]] == [1, 3, 4, 5]
+    assert re.findall(r'id="episode-(\d+)"', text) == ["3", "5"]
+    assert "Only 4 of 6 episodes" in text
+    assert "Pictures and timelines of 2 of 4 episodes, evenly" in text
+    assert main(["report", *flags, "--overwrite", "--episodes", "1,9"]) == 1
+    assert capsys.readouterr().err == f"error: dataset '{made}': it has no episode 9 (it has 6)\n"
+    assert path.read_text() == text
+
+
+def test_nothing_is_replaced_unless_asked(made, tmp_path, capsys):
+    before = compute_digests(made)
+    path = tmp_path / "page.html"
+    path.write_text("mine")
+    flags = ["report", "--root", str(made)]
+    assert main([*flags, "--out", str(path)]) == 2
+    said = f"error: '{path}' exists already. Choose another --out, or add --overwrite\n"
+    assert capsys.readouterr().err == said
+    assert path.read_text() == "mine"
+    assert main([*flags, "--out", str(path), "--overwrite"]) == 0
+    assert path.read_text().startswith("<!doctype html>")
+    assert main([*flags, "--out", str(tmp_path / "new" / "folder")]) == 0
+    assert (tmp_path / "new" / "folder" / "index.html").is_file()
+    assert main([*flags, "--out", str(made / "page.html")]) == 2
+    assert main(flags) == 2
+    assert "say where the page goes" in capsys.readouterr().err
+    assert main([*flags, "--out", str(tmp_path / "a.html"), "--points", "1"]) == 2
+    assert capsys.readouterr().err == "error: --points must be 2 or more, got 1\n"
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["new", "page.html"]
+    assert compute_digests(made) == before
+
+
+def test_a_dry_run_writes_nothing(made, tmp_path, capsys):
+    flags = ["report", "--root", str(made), "--dry-run", "--detailed", "4"]
+    assert main([*flags, "--out", str(tmp_path / "page.html")]) == 0
+    assert main(flags) == 0
+    assert capsys.readouterr().out == "6 episodes, 4 of them with pictures and timelines\n" * 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_read_is_named_and_the_rest_is_shown(foreign, tmp_path, capsys):
+    root = Path(shutil.copytree(foreign, tmp_path / "data"))
+    video = next(root.rglob("*.mp4"))
+    video.write_bytes(video.read_bytes()[:2000])
+    path = tmp_path / "page.html"
+    assert main(["report", "--root", str(root), "--out", str(path)]) == 1
+    assert "2 of 2 episodes cannot be read as a whole; the page says why" in capsys.readouterr().err
+    text = path.read_text()
+    assert text.count('<p class="problem">videos/observation.images.cam/') >= 2
+    assert [len(each["groups"]) for each in read_timelines(path)] == [1, 1]
+
+
+def test_memory_does_not_grow_with_the_dataset(made, tmp_path):
+    """What is held after many episodes is what is held after few."""
+
+    def measure(repeats: int) -> int:
+        limits = Limits(0, 160, 50)
+        with Source(made) as source:
+            findings = list(survey(source))
+            count = repeats * len(findings)
+            path = tmp_path / f"{repeats}.html"
+            with Report(path, source, limits, count, count, chosen=False) as report:
+                tracemalloc.start()
+                for _ in range(repeats):
+                    for finding in findings:
+                        report.add(finding)
+                held, peak = tracemalloc.get_traced_memory()
+                tracemalloc.stop()
+                report.finish([], [])
+        assert len(read_figures(path)["rows"]) == count
+        return peak
+
+    measure(1)  # what is imported and kept the first time
+    assert measure(12) < measure(3) + 100_000
+
+
+def test_thinning_keeps_peaks():
+    values = np.sin(np.arange(9000) / 500)
+    values[4321] = 7
+    values[1234:1240] = np.nan
+    few = thin(values, 300)
+    assert few.shape == (300,)
+    assert np.nanmax(few) == 7
+    assert np.nanmin(few) == np.nanmin(values)
+    assert int(np.nanargmax(few)) in (2 * (4321 * 150 // 9000), 2 * (4321 * 150 // 9000) + 1)
+    both = thin(np.stack([values, -values], axis=1), 301)
+    assert both.shape == (300, 2)
+    np.testing.assert_array_equal(both[:, 0], few)
+    np.testing.assert_array_equal(thin(values[:300], 300), values[:300])
+
+
+@pytest.mark.parametrize("values", [[0.1, -3, 2e5], [5, 5], [], [np.nan, 1, np.inf], [np.nan]])
+def test_series_come_back(values):
+    values = np.array(values, float)
+    back = decode(encode(values))
+    known = np.isfinite(values)
+    np.testing.assert_array_equal(np.isfinite(back), known)
+    span = np.ptp(values[known]) if known.any() else 0
+    np.testing.assert_allclose(back[known], values[known], atol=span * 1e-4 + 1e-6)
+
+
+def test_scripts_hold_any_text():
+    text = dump_script({"a": EVIL, "b": "\u2028 ü"})
+    assert "<" not in text
+    assert json.loads(text) == {"a": EVIL, "b": "\u2028 ü"}
