@@ -260,7 +260,7 @@ def test_unknown_device_lists_the_available_ones() -> None:
     with pytest.raises(UnknownName) as error:
         make_device(DeviceConfig(type="webxr"))
     shipped = ", ".join(name for name in DEVICES if name != "looker")  # which test_collect adds
-    assert shipped == "replay, scripted, simulated"
+    assert shipped == "avp, replay, scripted, simulated"
     assert str(error.value) == f"unknown device 'webxr'. Known: {', '.join(DEVICES)}"
 
 

@@ -12,6 +12,14 @@ DEVICES: Registry[Callable[[DeviceConfig], Device]] = Registry("device")
 """Devices by name, each made as ``factory(config)``."""
 
 
+@DEVICES.register("avp")
+def _make_avp(config: DeviceConfig) -> Device:
+    # gRPC starts threads of its own; who needs no headset shall not have them.
+    from xop_lerobot.operator.devices.avp import AvpDevice  # noqa: PLC0415
+
+    return AvpDevice(config)
+
+
 def make_device(config: DeviceConfig) -> Device:
     """Make the device that `config` names; `connect()` then opens it.
 

@@ -14,8 +14,9 @@ class DeviceConfig:
     """Settings of an operator device.
 
     Attributes:
-        type: ``"replay"`` plays a recorded person, ``"scripted"`` a list of waypoints, and
-            ``"simulated"`` is a person who sees the robot and does its task.
+        type: ``"replay"`` plays a recorded person, ``"scripted"`` a list of waypoints,
+            ``"simulated"`` is a person who sees the robot and does its task, and ``"avp"`` is
+            somebody in an Apple Vision Pro.
         path: `replay`: an ``.npz`` recording, or the directory of a recorded dataset.
             `scripted`: a YAML file, or the name of a script that is built in.
         mode: Mode in which the operator starts, ``"stationary"`` or ``"mobile"``, where the
@@ -27,6 +28,9 @@ class DeviceConfig:
         seed: `scripted`: seed of the person's sway and tremor; `simulated`: of the person.
         noise: `scripted`, `simulated`: scale of sway and tremor, 0 none, 1 as
             published for healthy people.
+        host: `avp`: name or address of the headset.
+        port: `avp`: its port; 0 is the one of its app, 12345.
+        stale_s: `avp`: without a new pose of the head for so long, the operator has let go [s].
     """
 
     type: str = "scripted"
@@ -37,6 +41,9 @@ class DeviceConfig:
     hold_s: float = 6.0
     seed: int = 0
     noise: float = 1.0
+    host: str | None = None
+    port: int = 0
+    stale_s: float = 0.25
 
     def __post_init__(self) -> None:
         """Check every value.
@@ -51,6 +58,9 @@ class DeviceConfig:
         _check_at_least("device.hold_s", self.hold_s, 0)
         _check_at_least("device.noise", self.noise, 0)
         _check_at_least("device.seed", self.seed, 0)
+        _check_at_least("device.port", self.port, 0)
+        if not (math.isfinite(self.stale_s) and self.stale_s > 0):
+            raise BadValue(f"device.stale_s must be finite and above 0, got {self.stale_s}")
         if not (math.isfinite(self.speed) and self.speed > 0):
             raise BadValue(f"device.speed must be finite and above 0, got {self.speed}")
 

@@ -1,0 +1,201 @@
+"""What of a live stream is believed, frame by frame."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from xop_lerobot.errors import BadValue
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
+from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
+
+DT = 1 / 100
+
+
+def person(t: float, **changes) -> OperatorFrame:
+    """Somebody who sways, as every tracked person does."""
+    sway = 0.01 * np.array([np.sin(3 * t), np.cos(2 * t), np.sin(5 * t)])
+    quat = quat_exp(sway)
+    head = make_pose(sway + [0, 0, 1.6], quat)
+    wrists = [make_pose(sway + [0.3, y, 1.1], quat) for y in (0.2, -0.2)]
+    frame = OperatorFrame(t, head, *wrists, pinch=np.array([0.07, 0.06]))
+    return dataclasses.replace(frame, **changes)
+
+
+def shift(pose: np.ndarray, x: float) -> np.ndarray:
+    return pose + np.array([x, 0, 0, 0, 0, 0, 0])
+
+
+def run(guard: StreamGuard, start: float, end: float, change=lambda frame: frame):
+    times = np.arange(round(start / DT), round(end / DT)) * DT
+    return [guard.take(change(person(float(t)))) for t in times]
+
+
+def test_a_good_stream_comes_through_to_the_bit():
+    guard = StreamGuard()
+    for taken, t in zip(run(guard, 0, 1), np.arange(100) * DT, strict=True):
+        assert taken is not None
+        for name in ("head", "left_wrist", "right_wrist", "pinch", "tracked"):
+            np.testing.assert_array_equal(getattr(taken, name), getattr(person(t), name))
+    assert guard.counts == {"taken": 100}
+
+
+def test_repeats_are_dropped_and_do_not_keep_a_dead_stream_alive():
+    guard = StreamGuard()
+    run(guard, 0, 0.5)
+    dead = person(0.49)
+    assert all(guard.take(dataclasses.replace(dead, time=t)) is None for t in np.arange(0.5, 2, DT))
+    assert guard.counts == {"taken": 50, "repeated": 150}
+
+
+@pytest.mark.parametrize(
+    ("head", "reason"),
+    [
+        (np.full(7, np.nan), "head_not_finite"),
+        (np.array([0, 0, np.inf, 1, 0, 0, 0]), "head_not_finite"),
+        (np.zeros(7), "head_no_rotation"),
+        (np.array([1e6, 0, 1.6, 1, 0, 0, 0]), "head_out_of_space"),
+        (np.array([1.0, 0, 1.6, 1, 0, 0, 0]), "head_jump"),
+        (np.array([0, 0, 1.6, 0, 0, 0, 1.0]), "head_jump"),
+    ],
+)
+def test_a_frame_without_a_good_head_is_dropped(head, reason):
+    guard = StreamGuard()
+    run(guard, 0, 0.5)
+    assert guard.take(person(0.5, head=head)) is None
+    assert guard.counts == {"taken": 50, reason: 1}
+    assert guard.take(person(0.51)) is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"left_wrist": np.full(7, np.nan)}, "left_not_finite"),
+        ({"left_wrist": np.array([0.3, 0.2, 1.1, 0, 0, 0, 0])}, "left_no_rotation"),
+        ({"left_wrist": np.array([1.1, 0.2, 1.1, 1, 0, 0, 0])}, "left_jump"),
+        ({"left_wrist": np.array([2.0, 0.2, 1.1, 1, 0, 0, 0])}, "left_out_of_reach"),
+        ({"tracked": np.array([True, False, True])}, "left_lost"),
+        ({"pinch": np.array([np.nan, 0.06])}, "left_bad_pinch"),
+        ({"pinch": np.array([-0.01, 0.06])}, "left_bad_pinch"),
+        ({"pinch": np.array([0.9, 0.06])}, "left_bad_pinch"),
+    ],
+)
+def test_a_bad_hand_is_lost_alone_and_stays_where_it_was(changes, reason):
+    guard = StreamGuard()
+    last = run(guard, 0, 0.5)[-1]
+    taken = guard.take(person(0.5, **changes))
+    np.testing.assert_array_equal(taken.tracked, [True, False, True])
+    np.testing.assert_array_equal(taken.left_wrist, last.left_wrist)
+    assert taken.pinch[0] == last.pinch[0]
+    np.testing.assert_array_equal(taken.right_wrist, person(0.5).right_wrist)
+    assert guard.counts == {"taken": 51, reason: 1}
+    assert guard.take(person(0.51)).tracked.all()
+
+
+def test_a_hand_that_freezes_while_the_head_moves_is_lost_after_a_moment():
+    guard = StreamGuard()
+    run(guard, 0, 0.5)
+    frozen = person(0.49).left_wrist
+    taken = run(guard, 0.5, 1.0, lambda f: dataclasses.replace(f, left_wrist=frozen))
+    tracked = [frame.tracked[1] for frame in taken]
+    assert all(tracked[:7])  # devices repeat a pose now and then
+    assert not any(tracked[9:])
+    assert all(frame.tracked[[0, 2]].all() for frame in taken)
+    assert run(guard, 1.0, 1.1)[0].tracked.all()
+
+
+def test_a_head_that_freezes_while_the_hands_move_is_dropped_after_a_quarter_second():
+    guard = StreamGuard()
+    run(guard, 0, 0.5)
+    frozen = person(0.49).head
+    taken = run(guard, 0.5, 1.0, lambda f: dataclasses.replace(f, head=frozen))
+    assert all(frame is not None for frame in taken[:24])
+    assert all(frame is None for frame in taken[26:])
+
+
+def test_a_jump_that_lasts_is_where_the_limb_is_now():
+    guard = StreamGuard()
+    run(guard, 0, 0.5)
+    taken = run(
+        guard, 0.5, 1.0, lambda f: dataclasses.replace(f, left_wrist=shift(f.left_wrist, 0.6))
+    )
+    tracked = [frame.tracked[1] for frame in taken]
+    assert not any(tracked[:14])
+    assert all(tracked[16:])
+    everything = {
+        name: (lambda f, n=name: shift(getattr(f, n), 3.0))
+        for name in ("head", "left_wrist", "right_wrist")
+    }
+    moved = run(
+        guard,
+        1.0,
+        2.0,
+        lambda f: dataclasses.replace(f, **{n: move(f) for n, move in everything.items()}),
+    )
+    # Longer than a stream is stale, so that nobody is engaged when the head is believed again.
+    assert all(frame is None for frame in moved[:39])
+    assert moved[-1] is not None
+    assert guard.relocations == 1
+
+
+def test_jumps_to_and_fro_are_never_believed():
+    guard = StreamGuard()
+    run(guard, 0, 0.5)
+    for i, t in enumerate(np.arange(50, 200) * DT):
+        taken = guard.take(person(t, head=shift(person(t).head, (i % 2 + 1) * 1.0)))
+        assert taken is None
+    assert guard.counts["head_jump"] == 150
+
+
+def test_old_frames_are_dropped():
+    guard = StreamGuard()
+    assert guard.take(person(1.0), source_time=1.0) is not None
+    assert guard.take(person(1.1), source_time=0.9) is None
+    assert guard.take(person(1.2), source_time=1.0) is None
+    assert guard.take(person(1.3), source_time=np.nan) is None
+    assert guard.take(person(1.4), source_time=1.4) is not None
+    assert guard.take(person(1.4), source_time=1.5) is None
+    assert guard.counts == {"taken": 2, "out_of_order": 3, "repeated": 1}
+
+
+numbers = st.floats(width=32)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.lists(numbers, min_size=23, max_size=23), max_size=6))
+def test_no_bad_number_ever_gets_through(rows):
+    guard = StreamGuard()
+    run(guard, 0, 0.05)
+    for i, row in enumerate(rows):
+        values = np.array(row)
+        taken = guard.take(
+            OperatorFrame(1.0 + i, values[:7], values[7:14], values[14:21], values[21:])
+        )
+        if taken is not None:
+            for pose in (taken.head, taken.left_wrist, taken.right_wrist):
+                assert np.isfinite(pose).all()
+                assert np.linalg.norm(pose[3:]) == pytest.approx(1, abs=0.01)
+            assert ((taken.pinch >= 0) & (taken.pinch <= 0.4)).all()
+
+
+def test_people_are_not_refused():
+    """Brisk but possible: a hand that is thrown out at 6 m/s, a turn of the head of 9 rad/s."""
+    guard = StreamGuard()
+    for i in range(40):
+        t = i * DT
+        frame = person(t)
+        out = shift(frame.left_wrist, 0.3 * np.sin(20 * t))
+        turned = make_pose(
+            frame.head[:3], quat_multiply(frame.head[3:], quat_exp(np.array([0, 0, 9 * t])))
+        )
+        assert guard.take(dataclasses.replace(frame, left_wrist=out, head=turned)).tracked.all()
+
+
+def test_config_errors():
+    with pytest.raises(BadValue, match=r"guard\.stale must be finite and above 0, got 0"):
+        GuardConfig(stale=0)

@@ -1,0 +1,230 @@
+"""What live headsets have in common: a thread of their own, the newest frame, and its age."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import threading
+import time as clocks
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from xop_lerobot.errors import XopError
+from xop_lerobot.operator.device import Device
+from xop_lerobot.operator.devices.config import DeviceConfig
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
+
+logger = logging.getLogger(__name__)
+
+RETRY_S = 1.0
+"""Time between two attempts to connect [s]."""
+SILENT_S = 2.0
+"""A connection over which nothing came for so long is made anew [s]."""
+RATE_WINDOW_S = 1.0
+"""Time over which the rate of the stream is counted [s]."""
+
+
+class StreamLost(XopError):
+    """The stream has ended; the message says how."""
+
+
+@dataclass(frozen=True)
+class StreamStatus:
+    """How the stream is doing.
+
+    Attributes:
+        connected: Whether the device answers.
+        age: Time since the last frame that was believed [s]; infinite before the first.
+        rate: Believable frames in the last second [Hz].
+        counts: Frames and limbs by what became of them: `taken`, `repeated`, and every reason
+            for a refusal.
+        connections: How often a connection was made.
+        trouble: What is wrong, in words; empty if nothing is.
+    """
+
+    connected: bool
+    age: float
+    rate: float
+    counts: dict[str, int]
+    connections: int
+    trouble: str
+
+
+class LiveDevice(Device):
+    """A headset that somebody wears now.
+
+    Its stream is read on a thread of its own, as fast as it comes, and each frame is stamped at
+    its receipt and judged at once; only the newest is kept. So `read` never waits, and nothing
+    queues up: however slow the readers are, what they get is never older than the stream. When
+    no believable frame came for `stale` seconds, `read` says that nothing is tracked. The
+    connection is made anew by itself whenever it ends.
+
+    A subclass implements `stream` and `interrupt`, and calls `receive` with each frame.
+
+    Args:
+        config: Its settings.
+        guard: What counts as a fault of the stream.
+        clock: The clock of the stamps [s].
+    """
+
+    def __init__(
+        self,
+        config: DeviceConfig,
+        guard: GuardConfig | None = None,
+        clock: Callable[[], float] = clocks.monotonic,
+    ) -> None:
+        self.config = config
+        self.start_mode = config.start_mode
+        self.guard = StreamGuard(guard or GuardConfig(stale=config.stale_s))
+        self.clock = clock
+        self.handled = 0
+        """Messages that were dealt with, of whatever kind."""
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._newest: OperatorFrame | None = None
+        self._relocations = self._read_relocations = 0
+        self._stamps: deque[float] = deque()
+        self._heard_at = 0.0
+        self._connections = 0
+        self._connected = False
+        self._trouble = ""
+
+    @property
+    @abstractmethod
+    def address(self) -> str:
+        """What it connects to, as it reads in a message."""
+
+    @abstractmethod
+    def stream(self) -> None:
+        """Connect, and call `hear` and `receive` until the stream ends or is interrupted.
+
+        Raises:
+            StreamLost: If it ends, or cannot be connected to.
+        """
+
+    @abstractmethod
+    def interrupt(self) -> None:
+        """Make `stream` return soon; called from other threads."""
+
+    def connect(self) -> None:
+        """Begin to connect, and return at once: the person may put the headset on later."""
+        if self._thread is not None:
+            return
+        self._stop.clear()
+        self._heard_at = self.clock()
+        self._thread = threading.Thread(target=self._run, name="xop-headset", daemon=True)
+        self._thread.start()
+        logger.info("Waiting for %s.", self.address)
+
+    def disconnect(self) -> None:
+        """Close the connection; may be called twice."""
+        self._stop.set()
+        self.interrupt()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+            self._thread = None
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self.stream()
+                lost = StreamLost("the stream has ended")
+            except StreamLost as error:
+                lost = error
+            except Exception as error:  # noqa: BLE001  the robot holds, whatever it was
+                logger.exception("%s: its stream cannot be read", self.address)
+                lost = StreamLost(f"{type(error).__name__}: {error}")
+            with self._lock:
+                self._connected = False
+            if not self._stop.is_set():
+                self._say(f"{self.address}: {lost}. Trying again every {RETRY_S:g} s.")
+            self._stop.wait(RETRY_S)
+
+    def _say(self, trouble: str) -> None:
+        """Warn once of each trouble."""
+        if trouble and trouble != self._trouble:
+            logger.warning(trouble)
+        self._trouble = trouble
+
+    def hear(self) -> None:
+        """Note that the device has sent something, whatever it is."""
+        with self._lock:
+            self._heard_at = self.clock()
+            if self._connected:
+                return
+            # After a pause somebody else's head may be in it, anywhere.
+            self.guard.reset()
+            self._relocations += self._connections > 0
+            self._connected = True
+            self._connections += 1
+            self._trouble = ""
+        logger.info("%s is connected.", self.address)
+
+    def refuse(self, reason: str) -> None:
+        """Count a message that holds no frame."""
+        with self._lock:
+            self.guard.counts[reason] += 1
+            self.handled += 1
+
+    def receive(self, frame: OperatorFrame, source_time: float | None = None) -> None:
+        """Take a frame of the device; its stamp is set here.
+
+        Args:
+            frame: Head, wrists and pinches in the convention of `OperatorFrame`; what cannot
+                be decoded is NaN.
+            source_time: The device's own stamp or number, where it has one.
+        """
+        with self._lock:
+            relocations = self.guard.relocations
+            stamped = dataclasses.replace(frame, time=self.clock())
+            taken = self.guard.take(stamped, source_time)
+            self._relocations += self.guard.relocations - relocations
+            if taken is not None:
+                self._newest = taken
+                self._stamps.append(taken.time)
+                while self._stamps[0] < taken.time - RATE_WINDOW_S:
+                    self._stamps.popleft()
+            self.handled += 1
+
+    def read(self, time: float) -> OperatorFrame | None:
+        """Return the newest frame, or one in which nothing is tracked if it is too old.
+
+        Its time is the host's, on the device's clock, whatever the robot's `time` is.
+        """
+        del time
+        with self._lock:
+            now, newest = self.clock(), self._newest
+            silent = self._connected and now - self._heard_at > SILENT_S
+            moved = self._relocations != self._read_relocations
+            self._read_relocations = self._relocations
+            if silent:
+                self._connected = False
+        if silent:
+            self._say(f"{self.address}: nothing has come for {SILENT_S:g} s. Connecting anew.")
+            self.interrupt()
+        if newest is None:
+            return None
+        if moved or now - newest.time > self.guard.config.stale:
+            return dataclasses.replace(newest, time=now, tracked=np.zeros(3, dtype=bool))
+        return newest
+
+    @property
+    def status(self) -> StreamStatus:
+        """How the stream is doing now."""
+        with self._lock:
+            now = self.clock()
+            age = float("inf") if self._newest is None else now - self._newest.time
+            return StreamStatus(
+                connected=self._connected,
+                age=age,
+                rate=sum(t > now - RATE_WINDOW_S for t in self._stamps) / RATE_WINDOW_S,
+                counts=dict(self.guard.counts),
+                connections=self._connections,
+                trouble=self._trouble,
+            )

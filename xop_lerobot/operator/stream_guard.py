@@ -1,0 +1,253 @@
+"""What of a live stream can be believed: each limb is judged, and each refusal counted."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.state import FRAMES
+from xop_lerobot.transforms import rotation_error
+
+MAX_STEP_TIME = 0.04
+"""However long nothing was believed, a limb has moved for no longer than that [s]."""
+NORM_TOLERANCE = 1e-2
+"""How far a quaternion's norm may be from 1."""
+SPACE = 100.0
+"""Farther from the origin of its space nobody is [m]."""
+MAX_PINCH = 0.4
+"""Thumb and index are never farther apart [m]."""
+OPEN_PINCH = 0.08
+"""Distance of thumb and index of a hand of which none was seen yet [m]."""
+
+
+@dataclass
+class GuardConfig:
+    """What counts as a fault of the stream.
+
+    Attributes:
+        stale: Without a new believable frame for so long, the head counts as lost [s].
+        frozen: A hand whose pose does not change by a bit for so long, while others do, is
+            lost: devices go on sending the last one [s].
+        settle: A limb that has jumped is believed again when it went on smoothly from there
+            for so long; the head only after `stale` more, so that an engagement ends first [s].
+        head_speed: The head is never faster [m/s].
+        hand_speed: A hand is never faster [m/s].
+        head_turn: The head never turns faster [rad/s].
+        hand_turn: A hand never turns faster [rad/s].
+        slack: A jump up to this long is noise [m].
+        turn_slack: A jump up to this angle is noise [rad].
+        reach: A hand is never farther from the head [m].
+    """
+
+    stale: float = 0.25
+    frozen: float = 0.08
+    settle: float = 0.15
+    head_speed: float = 4.0
+    hand_speed: float = 8.0
+    head_turn: float = 15.0
+    hand_turn: float = 25.0
+    slack: float = 0.03
+    turn_slack: float = 0.3
+    reach: float = 1.3
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            BadValue: If one is not a finite number above 0.
+        """
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0):
+                raise BadValue(f"guard.{name} must be finite and above 0, got {value}")
+
+
+def _find_nonsense(pose: np.ndarray) -> str | None:
+    """Why `pose` can be the pose of nobody, None if it can. Shape (7,)."""
+    if not np.isfinite(pose).all():
+        return "not_finite"
+    if abs(float(np.linalg.norm(pose[3:])) - 1) > NORM_TOLERANCE:
+        return "no_rotation"
+    return "out_of_space" if float(np.abs(pose[:3]).max()) > SPACE else None
+
+
+class LimbGuard:
+    r"""Judges the poses of one limb in turn.
+
+    A pose is a jump if it is farther from the last believed one than
+    :math:`v_{max} \min(dt, 0.04 s) + slack`, or turned by more than the like. Poses that go on
+    smoothly from a jump are believed again after `settle`.
+
+    Args:
+        speed: Largest speed [m/s].
+        turn: Largest rate of turn [rad/s].
+        settle: How long a new place must last [s].
+        config: The slacks.
+    """
+
+    def __init__(self, speed: float, turn: float, settle: float, config: GuardConfig) -> None:
+        self._speed, self._turn, self._settle, self._config = speed, turn, settle, config
+        self.pose: np.ndarray | None = None
+        """The last pose that was believed. Shape (7,)."""
+        self._time = 0.0
+        self._raw = np.full(7, np.nan)
+        self._changed_at = 0.0
+        self._candidate: tuple[float, np.ndarray] | None = None
+        self._candidate_since = 0.0
+        self.relocations = 0
+        """How often a jump has turned out to be where the limb is now."""
+
+    def judge(self, time: float, pose: np.ndarray, frozen: float) -> str | None:
+        """Take the pose of `time` [s]; return why it is not believed, None if it is.
+
+        Args:
+            time: Stamp of the frame [s].
+            pose: x y z qw qx qy qz. Shape (7,).
+            frozen: Time without any change after which the limb is lost [s].
+        """
+        reason = _find_nonsense(pose)
+        if reason is not None:
+            return reason
+        if not np.array_equal(pose, self._raw):
+            self._raw, self._changed_at = np.array(pose, dtype=float), time
+        elif time - self._changed_at > frozen:
+            return "frozen"
+        if self.pose is None or self._follows(self._time, self.pose, time, pose):
+            self._believe(time, pose)
+            return None
+        candidate = self._candidate
+        if candidate is None or not self._follows(*candidate, time, pose):
+            self._candidate_since = time
+        self._candidate = (time, np.array(pose, dtype=float))
+        if time - self._candidate_since < self._settle:
+            return "jump"
+        self.relocations += 1
+        self._believe(time, pose)
+        return None
+
+    def _believe(self, time: float, pose: np.ndarray) -> None:
+        self._time, self.pose, self._candidate = time, np.array(pose, dtype=float), None
+
+    def _follows(self, before: float, last: np.ndarray, time: float, pose: np.ndarray) -> bool:
+        dt = min(time - before, MAX_STEP_TIME)
+        step = float(np.linalg.norm(pose[:3] - last[:3]))
+        turn = float(np.linalg.norm(rotation_error(pose[3:], last[3:])))
+        return (
+            step <= self._speed * dt + self._config.slack
+            and turn <= self._turn * dt + self._config.turn_slack
+        )
+
+
+class StreamGuard:
+    """Turns what a device sends into frames that can be believed.
+
+    A frame whose head cannot be believed is dropped; when that goes on, the stream is stale. A
+    hand that cannot be believed is marked as lost, and its pose and pinch stay as they were
+    last, so that no bad number gets through. All of it follows the stamps alone.
+
+    Args:
+        config: What counts as a fault.
+    """
+
+    def __init__(self, config: GuardConfig | None = None) -> None:
+        self.config = config or GuardConfig()
+        self.counts: Counter[str] = Counter()
+        """How many frames or limbs were refused, by reason; and `taken`, `repeated`."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was seen, as after a new connection; the counts stay."""
+        c = self.config
+        # A head that has jumped must be stale for the readers before it is believed again.
+        head = LimbGuard(c.head_speed, c.head_turn, c.settle + c.stale, c)
+        self._limbs = [
+            head,
+            *(LimbGuard(c.hand_speed, c.hand_turn, c.settle, c) for _ in FRAMES[1:]),
+        ]
+        self._pinch = np.full(2, OPEN_PINCH)
+        self._time = self._source_time = -math.inf
+        self._raw: np.ndarray | None = None
+
+    @property
+    def relocations(self) -> int:
+        """How often the head has turned out to be elsewhere; it is aligned anew then."""
+        return self._limbs[0].relocations
+
+    def take(self, frame: OperatorFrame, source_time: float | None = None) -> OperatorFrame | None:
+        """Judge a frame.
+
+        Args:
+            frame: As the device sent it, stamped with the time of its receipt.
+            source_time: The device's own stamp or number, where it has one: only newer frames
+                are taken.
+
+        Returns:
+            The frame as far as it can be believed, or None if it is dropped.
+        """
+        reason = self._find_old(frame, source_time)
+        if reason is None:
+            self._time = frame.time
+            if source_time is not None:
+                self._source_time = source_time
+            raw = np.concatenate([*(frame.pose(name) for name in FRAMES), frame.pinch])
+            # Devices that outrun their tracking send frames twice, and go on when it has died.
+            if self._raw is not None and np.array_equal(raw, self._raw):
+                reason = "repeated"
+            self._raw = raw
+        if reason is None:
+            reason = self._judge_head(frame)
+        if reason is not None:
+            self.counts[reason] += 1
+            return None
+        self.counts["taken"] += 1
+        return self._make(frame)
+
+    def _find_old(self, frame: OperatorFrame, source_time: float | None) -> str | None:
+        if frame.time <= self._time:
+            return "out_of_order"
+        if source_time is not None and not source_time > self._source_time:
+            return "repeated" if source_time == self._source_time else "out_of_order"
+        return None
+
+    def _judge_head(self, frame: OperatorFrame) -> str | None:
+        if not frame.tracked[0]:
+            return "head_lost"
+        reason = self._limbs[0].judge(frame.time, frame.head, self.config.stale)
+        return None if reason is None else f"head_{reason}"
+
+    def _make(self, frame: OperatorFrame) -> OperatorFrame:
+        tracked = np.ones(3, dtype=bool)
+        wrists, pinch = [], self._pinch.copy()
+        for hand, name in enumerate(FRAMES[1:]):
+            reason = self._judge_hand(frame, hand, name)
+            if reason is None:
+                pinch[hand] = frame.pinch[hand]
+            else:
+                self.counts[f"{name.removesuffix('_wrist')}_{reason}"] += 1
+                tracked[1 + hand] = False
+            limb = self._limbs[1 + hand]
+            # A hand that was never seen is nowhere; it is marked as lost.
+            wrists.append(frame.head if limb.pose is None else limb.pose)
+        self._pinch = pinch
+        return dataclasses.replace(
+            frame,
+            left_wrist=wrists[0].copy(),
+            right_wrist=wrists[1].copy(),
+            pinch=pinch.copy(),
+            tracked=tracked,
+        )
+
+    def _judge_hand(self, frame: OperatorFrame, hand: int, name: str) -> str | None:
+        if not frame.tracked[1 + hand]:
+            return "lost"
+        pose, pinch = frame.pose(name), float(frame.pinch[hand])
+        if np.linalg.norm(pose[:3] - frame.head[:3]) > self.config.reach:
+            return "out_of_reach"
+        if not (math.isfinite(pinch) and 0 <= pinch <= MAX_PINCH):
+            return "bad_pinch"
+        return self._limbs[1 + hand].judge(frame.time, pose, self.config.frozen)
