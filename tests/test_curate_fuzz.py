@@ -42,7 +42,7 @@ FLAGS: dict[str, list[list[str]]] = {
     "retarget": [["--out", "{out}", "--robot", "rby1", "--dry-run"]],
 }
 """Flags of each verb but for `--root`; a verb that is not named gets `--out` alone."""
-READERS = ("inspect", "filter", "trim", "merge", "split")
+READERS = ("inspect", "filter", "trim", "merge", "split", "report")
 """Verbs that go over all episodes and mend nothing."""
 
 
@@ -76,7 +76,10 @@ def run_verbs(root: Path, intact: Path, capsys, verbs=tuple(VERBS)) -> dict[str,
                 assert "error: " in err or "problem: " in err, what
                 assert len(err) < 4000 * EPISODES, what
             assert compute_digests(root) == before, f"changed the source: {what}"
-            if code or "--dry-run" in words:
+            if verb == "report" and out.exists():  # what is readable is shown, whatever is not
+                assert (out / "index.html").read_text().endswith("</html>\n"), what
+                assert len(list(out.iterdir())) == 1, what
+            elif code or "--dry-run" in words:
                 assert not out.exists(), f"left something behind: {what}"
             if out.exists():
                 for part in [path.parents[1] for path in out.rglob("meta/info.json")]:

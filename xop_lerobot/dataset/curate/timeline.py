@@ -348,5 +348,7 @@ def describe_changes(entry: EpisodeEntry, fps: float) -> list[dict[str, Any]]:
     for change in changes if isinstance(changes, list) else []:
         match change:
             case {"frame": int(frame), "change": what}:
+                if isinstance(what, dict):
+                    what = ", ".join(f"{name} {value}" for name, value in what.items())  # noqa: PLW2901
                 found.append({"t": round(frame / fps, 3), "text": str(what)[:300]})
     return found[:MOST_RUNS]

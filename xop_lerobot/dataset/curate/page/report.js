@@ -298,7 +298,8 @@ class Timeline {
         return mark;
       });
       const title = make("div", { textContent: panel.title + (panel.unit ? ` [${panel.unit}]` : "") });
-      box.append(make("div", { className: "panel" }, title, canvas, legend));
+      const width = curves.length > 4 ? "panel wide" : "panel";
+      box.append(make("div", { className: width }, title, canvas, legend));
       this.panels.push({ canvas, curves, low, high, marks });
       this.listen(canvas, PANEL.left, PANEL.right);
     }
