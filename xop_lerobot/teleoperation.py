@@ -16,10 +16,12 @@ from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig, EngageRefused, is_lost
+from xop_lerobot.operator.clutch import Clutch, Wish
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import Gesture, GestureConfig, GestureReader, grip_from_pinch
 from xop_lerobot.operator.goal_velocity import GoalVelocity
+from xop_lerobot.operator.hand_blend import HandBlend
 from xop_lerobot.operator.view import View
 from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.retarget.arm_driver import ArmDriver
@@ -61,7 +63,8 @@ class Teleoperation:
 
     While nobody is engaged, the robot is asked to hold the posture it is in. A device that
     engages by itself does so as soon as the robot has settled; loss of the head's tracking ends
-    an engagement, and the next one aligns anew, so no command ever makes a step. A fall ends it
+    an engagement, and the next one aligns anew, so no command ever makes a step. Who wears a
+    headset engages, and lets go, by the gesture of the clutch. A fall ends an engagement
     too, and nobody engages while the robot counts as fallen. `change` changes settings meanwhile.
 
     Args:
@@ -90,6 +93,10 @@ class Teleoperation:
         self.alignment = Alignment(config.alignment)
         self._velocity = GoalVelocity()
         self._gestures = GestureReader(config.gestures)
+        # Recordings and scripts engage by themselves, and replay as they were recorded.
+        has_person = not self.device.self_engaging
+        self._clutch = Clutch(config.gestures.clutch) if has_person else None
+        self._blend = HandBlend() if has_person else None
         self._sync = StateSync(self.morphology, model) if config.retargeter.sync else None
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
         self._arms = ArmDriver(self.morphology, holds_place=self.retargeter.holds_place)
@@ -101,6 +108,9 @@ class Teleoperation:
         self.alignment.disengage()
         self._velocity.reset()
         self._gestures.reset()
+        if self._clutch is not None:
+            self._clutch.reset()
+        self.notice = ""
         self._smoother.reset()
         if self._sync is not None:
             self._sync.reset()
@@ -255,11 +265,14 @@ class Teleoperation:
     ) -> OperatorFrame | None:
         """Engage or disengage where it is time to; return the frame to use."""
         is_over = state.fallen or self.device.is_paused(state.time)
+        if self._clutch is not None:
+            self._follow_clutch(self._clutch, state, frame, poses)
+            return frame
         if self.alignment.is_engaged:
             if frame is None or is_lost(frame) or is_over:
                 self.disengage()
             return frame
-        if not self.device.self_engaging or not state.settled or is_over:
+        if not state.settled or is_over:
             return frame
         if not self._started:
             self.device.start(state.time)
@@ -268,6 +281,47 @@ class Teleoperation:
         if frame is not None and not is_lost(frame):
             self._engage_itself(state, frame, poses)
         return frame
+
+    def _follow_clutch(
+        self,
+        clutch: Clutch,
+        state: RobotState,
+        frame: OperatorFrame | None,
+        poses: Mapping[str, np.ndarray],
+    ) -> None:
+        """Engage and let go as the person in the headset asks."""
+        wish = clutch.update(frame, self.alignment.is_engaged)
+        if self.alignment.is_engaged:
+            if state.fallen:
+                self._let_go("the robot has fallen")
+            elif wish is Wish.LET_GO and (frame is None or is_lost(frame)):
+                self._let_go("the headset no longer sees where the head is, or is silent")
+            elif wish is Wish.LET_GO:
+                self._let_go("you have let go")
+            return
+        if wish is not Wish.ENGAGE or frame is None:
+            return
+        if state.fallen:
+            self._tell("Not engaged: the robot has fallen. It engages when it stands.")
+        elif not state.settled:
+            self._tell("Not engaged yet: the robot still moves. Hold the gesture on.")
+        else:
+            try:
+                self.engage(state, frame, poses)
+            except EngageRefused as refusal:
+                self._tell(f"Not engaged: {refusal}")
+            else:
+                self._tell("Engaged: the robot follows you.")
+
+    def _let_go(self, reason: str) -> None:
+        self.disengage()
+        self._tell(f"Disengaged: {reason}. The robot holds; engage again by the gesture.")
+
+    def _tell(self, notice: str) -> None:
+        """Tell the operator what has happened, once each time."""
+        if notice != self.notice:
+            logger.info(notice)
+        self.notice = notice
 
     def _engage_itself(
         self, state: RobotState, frame: OperatorFrame, poses: Mapping[str, np.ndarray]
@@ -294,6 +348,8 @@ class Teleoperation:
         self._was_engaged, self._was_refused = True, False
         self._arms.forget()
         self._velocity.reset()
+        if self._blend is not None:
+            self._blend.engage(poses["head"], poses)
         self._follower.reset(state)
 
     def disengage(self) -> None:
@@ -313,6 +369,8 @@ class Teleoperation:
         if not self.alignment.is_engaged:
             return None
         goals = self.alignment.goal_poses(frame)
+        if self._blend is not None:
+            goals = self._blend.apply(state.time, goals, frame.tracked)
         velocities = self._velocity.update(state.time, goals)
         return Goal(goals, velocities, self._mode, grip_from_pinch(frame.pinch))
 

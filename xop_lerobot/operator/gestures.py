@@ -10,6 +10,7 @@ from enum import Enum
 import numpy as np
 
 from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.operator.clutch import ClutchConfig
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS
 
@@ -199,11 +200,13 @@ class GestureConfig:
         both_double_pinch: What a double pinch of both hands at once toggles: a constraint
             (`upright`), a preset against `default`, or `none`.
         window: Longest time between the double pinches of the two hands [s].
+        clutch: How somebody in a headset engages the robot, and lets it go.
     """
 
     double_pinch: DoublePinchConfig = field(default_factory=DoublePinchConfig)
     both_double_pinch: str = "upright"
     window: float = 0.5
+    clutch: ClutchConfig = field(default_factory=ClutchConfig)
 
     def __post_init__(self) -> None:
         """Check both values.
