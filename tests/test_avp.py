@@ -8,6 +8,7 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def server() -> Iterator[AvpServer]:
 
 
 @pytest.fixture
-def device(server) -> Iterator[AvpDevice]:
+def device(server) -> Iterator[Any]:
     made = make_device(DeviceConfig(type="avp", host="127.0.0.1", port=server.port))
     assert isinstance(made, AvpDevice)
     made.connect()
@@ -143,7 +144,7 @@ def test_request():
 # -- over the wire -------------------------------------------------------------------------
 
 
-def test_what_is_sent_is_read(server, device):
+def test_what_is_sent_is_read(server, device: Any):
     assert device.read(0.0) is None
     for i in range(20):
         wanted = make_person(i / 100)
@@ -158,7 +159,7 @@ def test_what_is_sent_is_read(server, device):
     assert [request.Head.m00, request.Head.m01] == [888, 127]
 
 
-def test_bad_messages_are_counted_and_the_stream_goes_on(server, device):
+def test_bad_messages_are_counted_and_the_stream_goes_on(server, device: Any):
     send(server, device, make_person(0))
     send(server, device, b"\xff\xff\xff")
     send(server, device, HandUpdate().SerializeToString())
@@ -167,7 +168,7 @@ def test_bad_messages_are_counted_and_the_stream_goes_on(server, device):
     assert device.status.connections == 1
 
 
-def test_a_silent_stream_is_stale_and_then_goes_on(server, device):
+def test_a_silent_stream_is_stale_and_then_goes_on(server, device: Any):
     send(server, device, make_person(0))
     assert device.read(0.0).tracked[0]
     time.sleep(0.3)
@@ -178,14 +179,14 @@ def test_a_silent_stream_is_stale_and_then_goes_on(server, device):
     assert device.read(0.0).tracked.all()
 
 
-def test_a_backlog_leaves_no_lag(server, device):
+def test_a_backlog_leaves_no_lag(server, device: Any):
     for i in range(60):
         server.send(make_person(i / 100))
     wait_for(lambda: device.handled == 60)
     np.testing.assert_allclose(device.read(0.0).head, make_person(0.59).head, atol=1e-5)
 
 
-def test_it_connects_again_and_the_head_is_lost_once(server, device, monkeypatch, caplog):
+def test_it_connects_again_and_the_head_is_lost_once(server, device: Any, monkeypatch, caplog):
     monkeypatch.setattr(live, "RETRY_S", 0.05)
     send(server, device, make_person(0))
     device.read(0.0)
@@ -206,7 +207,7 @@ def test_nobody_answers(monkeypatch, caplog):
     server = AvpServer()
     port = server.port
     server.close()
-    device = make_device(DeviceConfig(type="avp", host="127.0.0.1", port=port))
+    device: Any = make_device(DeviceConfig(type="avp", host="127.0.0.1", port=port))
     device.connect()
     wait_for(lambda: device.status.trouble != "")
     assert device.read(0.0) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ def shift(pose: np.ndarray, x: float) -> np.ndarray:
     return pose + np.array([x, 0, 0, 0, 0, 0, 0])
 
 
-def run(guard: StreamGuard, start: float, end: float, change=lambda frame: frame):
+def run(guard: StreamGuard, start: float, end: float, change=lambda frame: frame) -> list[Any]:
     times = np.arange(round(start / DT), round(end / DT)) * DT
     return [guard.take(change(person(float(t)))) for t in times]
 
@@ -88,13 +89,14 @@ def test_a_frame_without_a_good_head_is_dropped(head, reason):
 def test_a_bad_hand_is_lost_alone_and_stays_where_it_was(changes, reason):
     guard = StreamGuard()
     last = run(guard, 0, 0.5)[-1]
-    taken = guard.take(person(0.5, **changes))
+    taken: Any = guard.take(person(0.5, **changes))
     np.testing.assert_array_equal(taken.tracked, [True, False, True])
     np.testing.assert_array_equal(taken.left_wrist, last.left_wrist)
     assert taken.pinch[0] == last.pinch[0]
     np.testing.assert_array_equal(taken.right_wrist, person(0.5).right_wrist)
     assert guard.counts == {"taken": 51, reason: 1}
-    assert guard.take(person(0.51)).tracked.all()
+    after: Any = guard.take(person(0.51))
+    assert after.tracked.all()
 
 
 def test_a_hand_that_freezes_while_the_head_moves_is_lost_after_a_moment():
@@ -193,7 +195,8 @@ def test_people_are_not_refused():
         turned = make_pose(
             frame.head[:3], quat_multiply(frame.head[3:], quat_exp(np.array([0, 0, 9 * t])))
         )
-        assert guard.take(dataclasses.replace(frame, left_wrist=out, head=turned)).tracked.all()
+        taken: Any = guard.take(dataclasses.replace(frame, left_wrist=out, head=turned))
+        assert taken.tracked.all()
 
 
 def test_config_errors():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Callable
 
 import grpc
@@ -30,8 +31,8 @@ class AvpDevice(LiveDevice):
         BadValue: If there is no host.
     """
 
-    def __init__(self, config: DeviceConfig, clock: Callable[[], float] | None = None) -> None:
-        super().__init__(config, **({} if clock is None else {"clock": clock}))
+    def __init__(self, config: DeviceConfig, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(config, clock=clock)
         if not config.host:
             raise BadValue(
                 "device 'avp' needs the address of the headset: --teleop.device.host=ADDRESS "
