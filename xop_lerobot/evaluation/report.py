@@ -5,8 +5,6 @@ One HTML file that needs no other: pictures and films are inside it. The films l
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 import logging
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,25 +25,15 @@ from xop_lerobot.evaluation.report_plots import (
     plot_ways,
 )
 from xop_lerobot.evaluation.study import Cell, Results, compute_key
+from xop_lerobot.page import FOOT, embed, escape, make_head
 from xop_lerobot.plant.gl import RenderingUnavailable
 
 logger = logging.getLogger(__name__)
 
 PAGE = "index.html"
 _STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 84rem; color: #222;
-       padding: 0 1rem; }
-table { border-collapse: collapse; margin: 0.7rem 0; display: block; overflow-x: auto; }
-th, td { padding: 0.2rem 0.5rem; font-size: 14px; border-bottom: 1px solid #ddd; text-align: left;
-         white-space: nowrap; }
-th { border-bottom: 2px solid #888; }
-td small { color: #777; }
 tr.theirs td { color: #7a5c1e; background: #fdf8ec; }
 tr.absent td { color: #999; }
-img { max-width: 100%; }
-figure { display: inline-block; margin: 0.4rem; vertical-align: top; }
-figcaption { font-size: 13px; max-width: 320px; }
-.note { color: #555; font-size: 14px; }
 """
 _EXPLANATION = """
 <p class="note">Ours: a simulated person in the headset, the same one with the same seed for every
@@ -86,18 +74,13 @@ def write_report(
     for (robot, task), members in groups.items():
         chosen = [cells[i] for i in members]
         trials = [found[i] for i in members]
-        parts.append(f"<h2>{_escape(f'{robot}: {task}')}</h2>")
+        parts.append(f"<h2>{escape(f'{robot}: {task}')}</h2>")
         parts.append(_make_table(chosen, trials, [rows[i] for i in members], robot, task))
         parts += _make_plots(folder, f"{robot}-{task}", chosen, trials)
         parts += _make_films(folder, chosen, trials, results, videos)
     page = folder / PAGE
     body = "\n".join(parts)
-    page.write_text(
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>Simulation study</title><style>{_STYLE}</style></head>"
-        f"<body>\n{body}\n</body></html>\n",
-        encoding="utf-8",
-    )
+    page.write_text(make_head("Simulation study", _STYLE) + body + FOOT, encoding="utf-8")
     table = json.dumps(list(rows), indent=1, allow_nan=False)
     (folder / "table.json").write_text(table + "\n", encoding="utf-8")
     return page
@@ -114,7 +97,7 @@ def _make_head(cells: Sequence[Cell], found: Sequence[Sequence[Mapping[str, Any]
     return (
         "<h1>Simulation study</h1>"
         f"<p>{count} of {wanted} trials; {sim / 60:.0f} min simulated{pace}. "
-        f"{_escape(machine)}. State of the code: {_escape(', '.join(codes) or 'none')}.</p>"
+        f"{escape(machine)}. State of the code: {escape(', '.join(codes) or 'none')}.</p>"
         + _EXPLANATION
     )
 
@@ -146,19 +129,19 @@ def _make_table(
     """The table of one task of one robot; columns in which nothing stands are left out."""
     lines: list[tuple[str, str, list[str]]] = []  # class, title and fields of each row
     for cell, trials, row in zip(cells, found, rows, strict=True):
-        title = f"<b>{_escape(label_cell(cell, cells))}</b><br><small>"
-        title += f"{_escape(get_method(cell.setup.method).title)}</small>"
+        title = f"<b>{escape(label_cell(cell, cells))}</b><br><small>"
+        title += f"{escape(get_method(cell.setup.method).title)}</small>"
         if trials:
             lines.append(("ours", title, _make_fields(trials, row)))
         else:
-            lines.append(("absent", title, [_escape(row["note"] or "not run yet")]))
+            lines.append(("absent", title, [escape(row["note"] or "not run yet")]))
     for each in find_published(robot, task):
         title = f"{each.method} {each.variant}".strip() + f" ({each.low_level})"
-        title = f"{_escape(title)}<br><small>the paper, {each.setting}</small>"
+        title = f"{escape(title)}<br><small>the paper, {each.setting}</small>"
         lines.append(("theirs", title, _make_published_fields(each)))
     whole = [fields for _, _, fields in lines if len(fields) == len(_COLUMNS)]
     kept = [i for i in range(len(_COLUMNS)) if any(fields[i] != _NOTHING for fields in whole)]
-    head = "".join(f"<th>{_escape(name)}</th>" for name in ("method", *(_COLUMNS[i] for i in kept)))
+    head = "".join(f"<th>{escape(name)}</th>" for name in ("method", *(_COLUMNS[i] for i in kept)))
     body = []
     for kind, title, fields in lines:
         if len(fields) == 1:
@@ -241,7 +224,7 @@ def _make_plots(
         if picture is not None:
             (folder / f"{name}-{kind}.png").write_bytes(picture)
             parts.append(f"<h3>{title}</h3>")
-            parts.append(f'<img alt="{title}" src="data:image/png;base64,{_encode(picture)}">')
+            parts.append(f'<img alt="{title}" src="{embed(picture, "image/png")}">')
     return parts
 
 
@@ -266,22 +249,15 @@ def _make_films(
             try:
                 write_film(path, record, cell.setup, load_film(results.film_path(key)))
             except RenderingUnavailable as error:
-                return [f'<p class="note">No films: {_escape(str(error))}</p>']
+                return [f'<p class="note">No films: {escape(error)}</p>']
             except XopError as error:
                 logger.warning("no film of %s: %s", key, error)
                 continue
             end = "success" if record["success"] else record["failure"] or "time is up"
-            text = _escape(f"{label_cell(cell, cells)}, seed {record['seed']}: {end}")
+            text = escape(f"{label_cell(cell, cells)}, seed {record['seed']}: {end}")
             parts.append(
-                f'<figure><video controls muted loop width="320" src="data:video/mp4;base64,'
-                f'{_encode(path.read_bytes())}"></video><figcaption>{text}</figcaption></figure>'
+                '<figure><video controls muted loop width="320" '
+                f'src="{embed(path.read_bytes(), "video/mp4")}"></video>'
+                f"<figcaption>{text}</figcaption></figure>"
             )
     return ["<h3>Films</h3>", *parts] if parts else []
-
-
-def _encode(content: bytes) -> str:
-    return base64.b64encode(content).decode()
-
-
-def _escape(text: str) -> str:
-    return html.escape(text)
