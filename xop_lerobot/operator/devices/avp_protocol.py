@@ -25,7 +25,7 @@ VERSION_CODE = 25000
 """`Head.m30` of a request: the version of the protocol that we speak, 2.50."""
 SIGNALS = frozenset({666.0, 777.0, 778.0, 888.0, 999.0})
 """`Head.m00` of messages that hold something else than a head."""
-THUMB_TIP, INDEX_TIP, MIDDLE_KNUCKLE = 4, 9, 11
+THUMB_TIP, INDEX_TIP = 4, 9
 """Joints of a skeleton."""
 ORTHONORMAL = 0.02
 """How far R Rᵀ of a rotation may be from the identity."""
