@@ -275,6 +275,7 @@ def test_usage_errors(made, capsys):
         ("inspect",): "the following arguments are required: --root",
         ("inspect", "--rot", "x", "--root", "y"): "unknown flag of xop-curate inspect '--rot'. "
         "Known: --help, --json, --quiet, --root, --show",
+        ("inspect", "--rot", "x"): "unknown flag of xop-curate inspect '--rot'. Known: --help",
         ("filter", "--root", str(made), "--where", "success"): "say where the new dataset goes: "
         "--out=DIR, --in-place, or --dry-run",
         ("filter", "--root", str(made), "--where", "success", "--out", "x", "--in-place"): "--out "

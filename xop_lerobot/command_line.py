@@ -33,9 +33,17 @@ class CommandParser(argparse.ArgumentParser):
             BadValue: If a flag is absent or malformed.
             UnknownName: If one is unknown, listing the known ones.
         """
+        flags = [flag for action in self._actions for flag in action.option_strings]
+        known = [flag for flag in flags if flag.startswith("--")]
+
+        def refuse(word: str) -> NoReturn:
+            raise UnknownName(f"flag of {self.prog}", word, known)
+
+        # A misspelt flag is what is wrong, and not that the right one is absent.
+        for word in arguments:
+            if word.startswith("--") and word.partition("=")[0] not in known:
+                refuse(word)
         parsed, unknown = self.parse_known_args(arguments)
         if unknown:
-            flags = [flag for action in self._actions for flag in action.option_strings]
-            known = [flag for flag in flags if flag.startswith("--")]
-            raise UnknownName(f"flag of {self.prog}", unknown[0], known)
+            refuse(unknown[0])
         return parsed
