@@ -8,6 +8,7 @@ for the recorder. Publishing replaces one immutable value, so readers need no lo
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from threading import Lock
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xop_lerobot.errors import LinkError
+from xop_lerobot.operator.display import Progress, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.view import View
 from xop_lerobot.state import Goal, RobotState
@@ -111,6 +113,8 @@ class Session:
         obstacles: Walls and furniture of the episode, None where no task places any.
         episode: Index of the episode being recorded; the robot's seed depends on it.
         reset_count: Number of robot resets so far; a change tells the teleoperator to re-align.
+        pictures: What the robot's cameras saw last, by name.
+        progress: How far the recording is, None where nothing is recorded.
         configs: Resolved configuration of each part (`robot`, `teleop`), saved with a dataset.
     """
 
@@ -126,6 +130,9 @@ class Session:
         self.obstacles: tuple[Obstacle, ...] | None = None
         self.episode = 0
         self.reset_count = 0
+        self.pictures: Mapping[str, np.ndarray] = {}
+        self.progress: Progress | None = None
+        self._wishes: deque[Wish] = deque(maxlen=8)
         self.configs: dict[str, Any] = {}
 
     def announce(self, info: RobotInfo) -> None:
@@ -141,6 +148,7 @@ class Session:
             if not self._robots:
                 self._forget()
                 self.episode, self._reset_asked = 0, False
+                self.progress = None
 
     def begin_episode(self, index: int) -> None:
         """Ask the robot to start over as episode `index`, in its next `get_observation`."""
@@ -157,8 +165,20 @@ class Session:
         self._forget()
         self.reset_count += 1
 
+    def ask(self, wish: Wish) -> None:
+        """Ask the recorder for `wish`, which it grants with its next frame."""
+        self._wishes.append(wish)
+
+    def take_wishes(self) -> tuple[Wish, ...]:
+        """What was asked for since the last call; the recorder alone calls this."""
+        wishes = tuple(self._wishes)
+        self._wishes.clear()
+        return wishes
+
     def _forget(self) -> None:
         self.state = self.tick = self.outcome = self.view = self.obstacles = None
+        self.pictures = {}
+        self._wishes.clear()
 
     @property
     def robot(self) -> RobotInfo:

@@ -18,6 +18,8 @@ from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig, EngageRefused, is_lost
 from xop_lerobot.operator.clutch import Clutch, Wish
 from xop_lerobot.operator.devices import DeviceConfig, make_device
+from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress
+from xop_lerobot.operator.display import Wish as EpisodeWish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import Gesture, GestureConfig, GestureReader, grip_from_pinch
 from xop_lerobot.operator.goal_velocity import GoalVelocity
@@ -102,6 +104,7 @@ class Teleoperation:
         self._arms = ArmDriver(self.morphology, holds_place=self.retargeter.holds_place)
         self._smoother = CommandSmoother(self.morphology.command_space, self.dt)
         self._was_engaged = False
+        self._board = NoticeBoard()
         self._start_over()
 
     def _start_over(self) -> None:
@@ -110,7 +113,7 @@ class Teleoperation:
         self._gestures.reset()
         if self._clutch is not None:
             self._clutch.reset()
-        self.notice = ""
+        self._refusal = ""
         self._smoother.reset()
         if self._sync is not None:
             self._sync.reset()
@@ -120,6 +123,7 @@ class Teleoperation:
         self._arms.forget()
         self._follower.forget()
         self._last_time: float | None = None
+        self._shown: Display | None = None
 
     def connect(self) -> None:
         """Open the device; a recording is read and checked here."""
@@ -199,6 +203,21 @@ class Teleoperation:
         """What is in force, and the mode, as JSON knows them."""
         return {**self._settings.current.to_dict(), "mode": self._mode.name.lower()}
 
+    def show(self, progress: Progress | None, pictures: Mapping[str, np.ndarray]) -> None:
+        """Show the operator what `step` has made of the tick.
+
+        Args:
+            progress: How far the recording is, None where nothing is recorded.
+            pictures: What the robot's cameras see, by name. Shapes (height, width, 3), uint8.
+        """
+        if self._shown is None:
+            return
+        self.device.show(dataclasses.replace(self._shown, progress=progress, pictures=pictures))
+
+    def take_wishes(self) -> tuple[EpisodeWish, ...]:
+        """What the operator asks of the recording since the last call."""
+        return self.device.take_wishes()
+
     def step(self, state: RobotState) -> tuple[RobotAction, TickRecord]:
         """Decide what the robot does next.
 
@@ -229,6 +248,14 @@ class Teleoperation:
         else:
             wanted = self._drive(state, goal, poses["head"], dt)
         action = self._limit(state, wanted)
+        self._shown = Display(
+            time=state.time,
+            engaged=goal is not None,
+            mode=self._mode,
+            clutch=0.0 if self._clutch is None else self._clutch.progress,
+            notices=self._board.notices,
+            fallen=state.fallen,
+        )
         return action, self._make_record(measured, synced, frame, goal, wanted, changes)
 
     def _apply_changes(self) -> tuple[AppliedChange, ...]:
@@ -302,26 +329,40 @@ class Teleoperation:
         if wish is not Wish.ENGAGE or frame is None:
             return
         if state.fallen:
-            self._tell("Not engaged: the robot has fallen. It engages when it stands.")
+            self._refuse("Not engaged: the robot has fallen. It engages when it stands.")
         elif not state.settled:
-            self._tell("Not engaged yet: the robot still moves. Hold the gesture on.")
+            self._refuse("Not engaged yet: the robot still moves. Hold the gesture on.")
         else:
             try:
                 self.engage(state, frame, poses)
             except EngageRefused as refusal:
-                self._tell(f"Not engaged: {refusal}")
+                self._refuse(f"Not engaged: {refusal}")
             else:
-                self._tell("Engaged: the robot follows you.")
+                self._refusal = ""
+                self._tell(Cue.ENGAGED, "Engaged: the robot follows you.")
 
     def _let_go(self, reason: str) -> None:
         self.disengage()
-        self._tell(f"Disengaged: {reason}. The robot holds; engage again by the gesture.")
+        self._tell(
+            Cue.DISENGAGED,
+            f"Disengaged: {reason}. The robot holds; engage again by the gesture.",
+        )
 
-    def _tell(self, notice: str) -> None:
-        """Tell the operator what has happened, once each time."""
-        if notice != self.notice:
-            logger.info(notice)
-        self.notice = notice
+    def _refuse(self, refusal: str) -> None:
+        """Tell why nobody engages, once for each gesture that asks for it."""
+        if refusal != self._refusal:
+            self._tell(Cue.REFUSED, refusal)
+        self._refusal = refusal
+
+    def _tell(self, cue: Cue, text: str) -> None:
+        logger.info(text)
+        self._board.post(cue, text)
+
+    @property
+    def notice(self) -> str:
+        """What the operator was told last; empty if nothing was."""
+        notices = self._board.notices
+        return notices[-1].text if notices else ""
 
     def _engage_itself(
         self, state: RobotState, frame: OperatorFrame, poses: Mapping[str, np.ndarray]

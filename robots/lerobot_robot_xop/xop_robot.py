@@ -171,6 +171,7 @@ class XopRobot(Robot):
             self._session.view = self._stage.view(state)
         assert self._plant is not None
         pictures = {camera: self._plant.render(camera) for camera in self.cameras}
+        self._session.pictures = pictures
         return {**self._body.compute_proprioception(state), **pictures}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:

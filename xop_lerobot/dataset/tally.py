@@ -16,6 +16,7 @@ class Tally:
         first: Performance counter at the first frame [s].
         last: The same at the last frame [s].
         success: Whether the task is accomplished.
+        marked: The same as the operator has marked it, None where nobody has.
         fallen: Whether the robot fell.
         collision: Whether it touched anything but the ground.
         finished: Whether the operator's recording has played out.
@@ -29,6 +30,7 @@ class Tally:
         self.start_time = 0.0
         self.last = self.first = 0.0
         self.success = self.fallen = self.collision = self.finished = False
+        self.marked: bool | None = None
         self.task = ""
         self.settings: dict[str, Any] = {}
         self.changes: list[dict[str, Any]] = []

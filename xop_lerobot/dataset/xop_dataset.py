@@ -36,6 +36,7 @@ from xop_lerobot.dataset.tally import Tally
 from xop_lerobot.dataset.video_queue import VideoQueue
 from xop_lerobot.errors import XopError
 from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
+from xop_lerobot.operator.display import Progress, Wish
 
 logger = logging.getLogger(__name__)
 
@@ -235,10 +236,28 @@ class XopDataset(LeRobotDataset):
             tally.fallen |= state.fallen
             tally.collision |= state.collision
         tally.success = outcome is not None and outcome.success
+        if tally.marked is not None:
+            tally.success = tally.marked
+        self._grant_wishes()
         tally.finished = tick is not None and tick.finished
         is_over = tally.finished or tally.frames == self._tick_limit
         if is_over or (self._stop_on_success and tally.success):
             self._events["exit_early"] = True
+        length = tally.frames / self.fps
+        session.progress = Progress(self.num_episodes, tally.frames, length, tally.success)
+
+    def _grant_wishes(self) -> None:
+        """Do with the episode what the operator has asked for, as keys do."""
+        for wish in self._session.take_wishes():
+            if wish is Wish.SUCCESS:
+                self._tally.marked = not self._tally.success
+                self._tally.success = self._tally.marked
+                continue
+            self._events["exit_early"] = True
+            if wish is Wish.REDO:
+                self._events["rerecord_episode"] = True
+            elif wish is Wish.STOP:
+                self._events["stop_recording"] = True
 
     def _current_tick(self) -> TickRecord | None:
         """The teleoperator's record of this very tick, None if a policy drove the robot."""
@@ -283,12 +302,14 @@ class XopDataset(LeRobotDataset):
         if self._is_finalized:
             return
         super().finalize()
+        self._session.progress = None
         durability.forget_rotation(self)
         if self._own_root and self.num_episodes == 0:
             shutil.rmtree(self.root, ignore_errors=True)
 
     def _begin_next(self, index: int) -> None:
         self._tally = Tally()
+        self._session.progress = None
         self._session.begin_episode(index)
 
     def _secure(self) -> None:

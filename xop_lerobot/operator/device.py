@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 from xop_lerobot.command import Mode
+from xop_lerobot.operator.display import Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.view import View
 
@@ -51,3 +52,11 @@ class Device(ABC):
     def see(self, view: View) -> None:
         """Look at the robot and what is about it; only a simulated person needs to."""
         del view
+
+    def show(self, display: Display) -> None:
+        """Show the wearer the robot and the recording, once a tick; only headsets can."""
+        del display
+
+    def take_wishes(self) -> tuple[Wish, ...]:
+        """What was asked for of the recording, by buttons, since the last call."""
+        return ()

@@ -1,0 +1,116 @@
+"""What a headset shows its wearer of the robot, and what its wearer wants of the recording."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+
+
+class Cue(Enum):
+    """What has happened; a headset has a sound for each."""
+
+    ENGAGED = "engaged"
+    DISENGAGED = "disengaged"
+    REFUSED = "refused"
+    MODE = "mode"
+    SETTING = "setting"
+    END = "end"
+    REDO = "redo"
+    STOP = "stop"
+    SUCCESS = "success"
+
+
+class Wish(Enum):
+    """What the operator wants of the episode that is recorded."""
+
+    END = "end"
+    """Save it, and go on with the next."""
+    REDO = "redo"
+    """Discard it and record it again."""
+    STOP = "stop"
+    """Save it and end the session."""
+    SUCCESS = "success"
+    """Mark it as a success, or take the mark off again."""
+
+
+@dataclass(frozen=True)
+class Notice:
+    """One thing that the operator is told.
+
+    Attributes:
+        number: Counts up, so that each is shown and sounded once.
+        cue: What has happened.
+        text: The same in words.
+    """
+
+    number: int
+    cue: Cue
+    text: str
+
+
+class NoticeBoard:
+    """The last few notices; new ones are numbered on."""
+
+    def __init__(self, length: int = 5) -> None:
+        self._notices: deque[Notice] = deque(maxlen=length)
+        self._count = 0
+
+    def post(self, cue: Cue, text: str) -> None:
+        """Add a notice."""
+        self._count += 1
+        self._notices.append(Notice(self._count, cue, text))
+
+    @property
+    def notices(self) -> tuple[Notice, ...]:
+        """The last ones, the newest at the end."""
+        return tuple(self._notices)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a recording is.
+
+    Attributes:
+        episode: Index of the episode that is recorded.
+        frames: Its frames so far.
+        seconds: Its length so far [s].
+        success: Whether it counts as a success so far.
+    """
+
+    episode: int
+    frames: int
+    seconds: float
+    success: bool
+
+
+@dataclass(frozen=True)
+class Display:
+    """All that a headset can show of one tick.
+
+    Attributes:
+        time: Clock of the robot [s].
+        engaged: Whether the operator drives.
+        mode: Mode of the robot.
+        clutch: How much of the clutch's hold has passed, from 0 to 1.
+        notices: What has happened lately, the newest at the end.
+        warnings: What is wrong now, in words.
+        fallen: Whether the robot has fallen.
+        progress: How far the recording is, None where nothing is recorded.
+        pictures: What the robot's cameras see, by name. Shapes (height, width, 3), uint8.
+    """
+
+    time: float
+    engaged: bool = False
+    mode: Mode = Mode.STATIONARY
+    clutch: float = 0.0
+    notices: tuple[Notice, ...] = ()
+    warnings: tuple[str, ...] = ()
+    fallen: bool = False
+    progress: Progress | None = None
+    pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
