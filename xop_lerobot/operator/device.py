@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 from xop_lerobot.command import Mode
 from xop_lerobot.operator.display import Display, Wish
@@ -52,6 +53,10 @@ class Device(ABC):
     def see(self, view: View) -> None:
         """Look at the robot and what is about it; only a simulated person needs to."""
         del view
+
+    def introduce(self, robot: str, gestures: Mapping[str, str]) -> None:
+        """Be told the name of the robot and, by name, how to ask for what; headsets tell it."""
+        del robot, gestures
 
     def show(self, display: Display) -> None:
         """Show the wearer the robot and the recording, once a tick; only headsets can."""

@@ -20,6 +20,13 @@ def _make_avp(config: DeviceConfig) -> Device:
     return AvpDevice(config)
 
 
+@DEVICES.register("webxr")
+def _make_webxr(config: DeviceConfig) -> Device:
+    from xop_lerobot.operator.devices.webxr import WebXrDevice  # noqa: PLC0415
+
+    return WebXrDevice(config)
+
+
 def make_device(config: DeviceConfig) -> Device:
     """Make the device that `config` names; `connect()` then opens it.
 

@@ -13,6 +13,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError, Message
 
+from xop_lerobot.operator.devices.axes import WORLD
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.transforms import make_pose, quat_from_matrix
 
@@ -32,8 +33,6 @@ ORTHONORMAL = 0.02
 
 ENTRIES = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 
-# ARKit's world is x right, y up, z back; the operator's world is X forward, Y left, Z up.
-WORLD = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 # Columns: our axes in those of the anchor. The head's anchor lies as the world does. That of a
 # left wrist has x towards the fingers, y out of the palm; of a right one both the other way.
 AXES = {

@@ -15,8 +15,8 @@ class DeviceConfig:
 
     Attributes:
         type: ``"replay"`` plays a recorded person, ``"scripted"`` a list of waypoints,
-            ``"simulated"`` is a person who sees the robot and does its task, and ``"avp"`` is
-            somebody in an Apple Vision Pro.
+            ``"simulated"`` is a person who sees the robot and does its task, ``"avp"`` is
+            somebody in an Apple Vision Pro, ``"webxr"`` in any headset that has a browser.
         path: `replay`: an ``.npz`` recording, or the directory of a recorded dataset.
             `scripted`: a YAML file, or the name of a script that is built in.
         mode: Mode in which the operator starts, ``"stationary"`` or ``"mobile"``, where the
@@ -28,9 +28,18 @@ class DeviceConfig:
         seed: `scripted`: seed of the person's sway and tremor; `simulated`: of the person.
         noise: `scripted`, `simulated`: scale of sway and tremor, 0 none, 1 as
             published for healthy people.
-        host: `avp`: name or address of the headset.
-        port: `avp`: its port; 0 is the one of its app, 12345.
-        stale_s: `avp`: without a new pose of the head for so long, the operator has let go [s].
+        host: `avp`: name or address of the headset. `webxr`: address of this machine at which
+            it listens; None is 127.0.0.1, and 0.0.0.0 all of them.
+        port: `avp`: its port; 0 is the one of its app, 12345. `webxr`: port at which it listens;
+            0 is 8012.
+        stale_s: `avp`, `webxr`: without a new pose of the head for so long, the operator has let
+            go [s].
+        tls: `webxr`: whether the page is served over TLS; None: unless it listens on loopback,
+            where browsers ask for none.
+        code: `webxr`: pairing code, at least 6 letters or digits; None makes one for each
+            session.
+        max_delay_s: `webxr`: frames that are older on their arrival are dropped, so that the
+            operator lets go when all are [s].
     """
 
     type: str = "scripted"
@@ -44,6 +53,9 @@ class DeviceConfig:
     host: str | None = None
     port: int = 0
     stale_s: float = 0.25
+    tls: bool | None = None
+    code: str | None = None
+    max_delay_s: float = 0.3
 
     def __post_init__(self) -> None:
         """Check every value.
@@ -59,10 +71,10 @@ class DeviceConfig:
         _check_at_least("device.noise", self.noise, 0)
         _check_at_least("device.seed", self.seed, 0)
         _check_at_least("device.port", self.port, 0)
-        if not (math.isfinite(self.stale_s) and self.stale_s > 0):
-            raise BadValue(f"device.stale_s must be finite and above 0, got {self.stale_s}")
-        if not (math.isfinite(self.speed) and self.speed > 0):
-            raise BadValue(f"device.speed must be finite and above 0, got {self.speed}")
+        for name in ("stale_s", "max_delay_s", "speed"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise BadValue(f"device.{name} must be finite and above 0, got {value}")
 
     @property
     def start_mode(self) -> Mode:

@@ -45,6 +45,8 @@ class StreamStatus:
             for a refusal.
         connections: How often a connection was made.
         trouble: What is wrong, in words; empty if nothing is.
+        delay: How old a frame is when it arrives, half of the frames of the last second are
+            older [s]; None where the device cannot tell.
     """
 
     connected: bool
@@ -53,6 +55,7 @@ class StreamStatus:
     counts: dict[str, int]
     connections: int
     trouble: str
+    delay: float | None = None
 
 
 class LiveDevice(Device):
@@ -92,7 +95,7 @@ class LiveDevice(Device):
         self._stamps: deque[float] = deque()
         self._heard_at = 0.0
         self._connections = 0
-        self._connected = False
+        self._connected = self._left = False
         self._trouble = ""
 
     @property
@@ -186,7 +189,7 @@ class LiveDevice(Device):
             taken = self.guard.take(stamped, source_time)
             self._relocations += self.guard.relocations - relocations
             if taken is not None:
-                self._newest = taken
+                self._newest, self._left = taken, False
                 self._stamps.append(taken.time)
                 while self._stamps[0] < taken.time - RATE_WINDOW_S:
                     self._stamps.popleft()
@@ -203,16 +206,27 @@ class LiveDevice(Device):
             silent = self._connected and now - self._heard_at > SILENT_S
             moved = self._relocations != self._read_relocations
             self._read_relocations = self._relocations
+            left = self._left
             if silent:
                 self._connected = False
         if silent:
-            self._say(f"{self.address}: nothing has come for {SILENT_S:g} s. Connecting anew.")
-            self.interrupt()
+            self.end_silence()
         if newest is None:
             return None
-        if moved or now - newest.time > self.guard.config.stale:
+        if moved or left or now - newest.time > self.guard.config.stale:
             return dataclasses.replace(newest, time=now, tracked=np.zeros(3, dtype=bool))
         return newest
+
+    def end_silence(self) -> None:
+        """Do something about a connection over which nothing comes: make it anew."""
+        self._say(f"{self.address}: nothing has come for {SILENT_S:g} s. Connecting anew.")
+        self.interrupt()
+
+    def leave(self, reason: str) -> None:
+        """Take note that nobody wears the headset any more: at once, nothing is tracked."""
+        with self._lock:
+            self._connected, self._left = False, True
+        self._say(reason)
 
     @property
     def status(self) -> StreamStatus:

@@ -1,0 +1,234 @@
+"""Any headset whose browser knows WebXR; it opens a page that is served from here."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+import socket
+import statistics
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.operator.devices.config import DeviceConfig
+from xop_lerobot.operator.devices.live import RATE_WINDOW_S, SILENT_S, LiveDevice, StreamStatus
+from xop_lerobot.operator.display import Display, Wish
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.webxr.client import Client
+from xop_lerobot.operator.webxr.pairing import check_code, make_code
+from xop_lerobot.operator.webxr.pictures import Picture, PictureEncoder
+from xop_lerobot.operator.webxr.protocol import PORT, FrameMessage, write_display, write_pose
+from xop_lerobot.operator.webxr.server import HeadsetServer
+
+logger = logging.getLogger(__name__)
+
+LOOPBACK = "127.0.0.1"
+BACKLOG = 16
+
+
+class PortTaken(XopError):
+    """The port cannot be listened at; the message says why, and which flag chooses another."""
+
+
+class WebXrDevice(LiveDevice):
+    """A headset, or a stand-in for one, that opens our page and streams head and hands.
+
+    Args:
+        config: Its settings.
+
+    Raises:
+        BadValue: If the code is too short, or TLS is off where others could listen.
+    """
+
+    def __init__(self, config: DeviceConfig, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(config, clock=clock)
+        self.host, self.port = config.host or LOOPBACK, config.port or PORT
+        self.code = config.code or make_code()
+        check_code(self.code)
+        local = is_loopback(self.host)
+        self.tls = not local if config.tls is None else config.tls
+        if not self.tls and not local:
+            raise BadValue(
+                f"device.tls=false needs a host that only this machine reaches, got {self.host!r}; "
+                "headsets ask for TLS anyway"
+            )
+        self.introduction: tuple[str, dict[str, str]] = ("", {})
+        self._pictures = PictureEncoder()
+        self._display: Display | None = None
+        self._read: OperatorFrame | None = None
+        self._wishes: deque[Wish] = deque(maxlen=8)
+        self._delays: deque[tuple[float, float]] = deque()
+        self._listener: socket.socket | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop_stop: asyncio.Event | None = None
+        self._loop_lock = threading.Lock()
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"WebXR page at {self.url}"
+
+    @property
+    def url(self) -> str:
+        """Address of the page on this machine, without the code."""
+        host = "localhost" if self.host in (LOOPBACK, "0.0.0.0", "::") else self.host
+        return f"{'https' if self.tls else 'http'}://{host}:{self.port}/"
+
+    def connect(self) -> None:
+        """Listen, and return at once: the person may put the headset on later.
+
+        Raises:
+            PortTaken: If the port cannot be listened at.
+        """
+        if self._thread is not None:
+            return
+        self._listener = listen(self.host, self.port)
+        self._pictures.start()
+        logger.info("Open %s?code=%s", self.url, self.code)
+        super().connect()
+
+    def disconnect(self) -> None:
+        """Dismiss everybody and close the port; may be called twice."""
+        super().disconnect()
+        self._pictures.stop()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+
+    def introduce(self, robot: str, gestures: Mapping[str, str]) -> None:
+        """Say what a page tells who comes in.
+
+        Args:
+            robot: Name of the robot.
+            gestures: What the operator can ask for, and how, by name.
+        """
+        self.introduction = (robot, dict(gestures))
+
+    # -- the control loop's side -----------------------------------------------------------
+
+    def read(self, time: float) -> OperatorFrame | None:
+        """Return the newest frame, or one in which nothing is tracked if it is too old."""
+        self._read = super().read(time)
+        return self._read
+
+    def show(self, display: Display) -> None:
+        """Show this on every page; returns at once."""
+        self._display = display
+        if display.pictures:
+            self._pictures.give(display.pictures)
+
+    def take_wishes(self) -> tuple[Wish, ...]:
+        """What was asked for on the page since the last call."""
+        wishes = []
+        while self._wishes:
+            wishes.append(self._wishes.popleft())
+        return tuple(wishes)
+
+    @property
+    def status(self) -> StreamStatus:
+        """How the stream is doing now."""
+        with self._lock:
+            now = self.clock()
+            while self._delays and self._delays[0][0] < now - RATE_WINDOW_S:
+                self._delays.popleft()
+            delays = [delay for _, delay in self._delays]
+        status = super().status
+        return StreamStatus(
+            **{**vars(status), "delay": statistics.median(delays) if delays else None}
+        )
+
+    # -- the server's side -----------------------------------------------------------------
+
+    def stream(self) -> None:
+        """Serve until interrupted."""
+        asyncio.run(self._serve())
+
+    async def _serve(self) -> None:
+        stop = asyncio.Event()
+        with self._loop_lock:
+            self._loop, self._loop_stop = asyncio.get_running_loop(), stop
+            listener, self._listener = self._listener, None
+        if self._stop.is_set():
+            stop.set()
+        try:
+            listener = listener or listen(self.host, self.port)
+            await HeadsetServer(self, self.code).run(listener, stop)
+        finally:
+            with self._loop_lock:
+                self._loop = self._loop_stop = None
+
+    def interrupt(self) -> None:
+        """Stop serving."""
+        with self._loop_lock:
+            if self._loop is not None and self._loop_stop is not None:
+                self._loop.call_soon_threadsafe(self._loop_stop.set)
+
+    def end_silence(self) -> None:
+        """Say so; the page stays connected, and its wearer may go on."""
+        self._say(f"{self.address}: nothing has come for {SILENT_S:g} s")
+
+    def take(self, message: FrameMessage, client: Client) -> None:
+        """Take a frame of the operator, unless it is late."""
+        now = self.clock()
+        measured = client.measure_delay(message, now)
+        if measured is None:
+            self.refuse("clock_unknown")
+            return
+        self.hear()
+        delay, error = measured
+        with self._lock:
+            self._delays.append((now, delay))
+        if delay + error > self.config.max_delay_s:
+            self.refuse("late")
+            return
+        self.receive(message.frame, message.sent)
+
+    def wish(self, wish: Wish) -> None:
+        """Take what the operator wants of the recording."""
+        self._wishes.append(wish)
+
+    def write_shown(self, role: str) -> list[str]:
+        """What is to be shown now, as messages."""
+        display, frame = self._display, self._read
+        if display is None:
+            return []
+        status = self.status
+        tracked = np.zeros(3, dtype=bool) if frame is None else frame.tracked
+        shown = [write_display(display, display.warnings, tracked, status.rate, status.delay)]
+        if role == "monitor" and frame is not None:
+            shown.append(write_pose(frame))
+        return shown
+
+    def take_picture(self) -> Picture | None:
+        """The newest picture."""
+        return self._pictures.newest
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches `host`."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Listen at `host` and `port`.
+
+    Raises:
+        PortTaken: If that is not possible.
+    """
+    try:
+        return socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=BACKLOG
+        )
+    except OSError as fault:
+        raise PortTaken(
+            f"cannot listen at {host} port {port}: {fault.strerror or fault}. Choose another "
+            "--teleop.device.port, or end the session that has it"
+        ) from fault

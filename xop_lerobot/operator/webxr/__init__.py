@@ -1,0 +1,1 @@
+"""Any headset whose browser knows WebXR: a page and a WebSocket, served from here."""

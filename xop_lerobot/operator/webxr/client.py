@@ -1,0 +1,112 @@
+"""One page that is connected: its clock, and what is sent to it."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+
+from aiohttp import web
+
+from xop_lerobot.operator.webxr.clock_offset import ClockOffset
+from xop_lerobot.operator.webxr.pairing import RateLimit
+from xop_lerobot.operator.webxr.pictures import Picture
+from xop_lerobot.operator.webxr.protocol import FrameMessage, Pong, write_ping
+
+SEND_S = 0.05
+"""Period of what is shown [s]."""
+PING_S = 0.5
+"""Period of pings [s]."""
+UNSENT = 16 * 1024
+"""What the system may hold back for a slow client before it counts as slow [bytes]."""
+
+
+class Client:
+    """A page.
+
+    Args:
+        ws: Its WebSocket.
+        request: What it was opened with.
+        role: `operator` or `monitor`.
+        clock: Our clock [s].
+    """
+
+    def __init__(
+        self,
+        ws: web.WebSocketResponse,
+        request: web.Request,
+        role: str,
+        clock: Callable[[], float],
+    ) -> None:
+        self.ws, self.role, self._clock = ws, role, clock
+        self.rate = RateLimit()
+        self.active_at = clock()
+        """When it came in or sent its last frame [s]."""
+        self._offset = ClockOffset()
+        self._transport = request.transport
+        self._shown: list[str] = []
+        self._picture: Picture | None = None
+        _limit_buffer(self._transport)
+
+    def abort(self) -> None:
+        """Close the connection without a farewell."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    def take_pong(self, pong: Pong) -> None:
+        """Take the answer to a ping; others are ignored."""
+        self._offset.pong(pong.number, pong.sent, self._clock())
+
+    def measure_delay(self, message: FrameMessage, time: float) -> tuple[float, float] | None:
+        """How long ago a frame that comes at `time` [s] was sent.
+
+        Returns:
+            Delay and how far it may be off [s]; None while no ping was answered.
+        """
+        best = self._offset.best
+        if best is None:
+            return None
+        return max(time - (message.sent - best.offset), 0.0), best.error
+
+    async def send_on(
+        self,
+        write_shown: Callable[[str], list[str]],
+        take_picture: Callable[[], Picture | None],
+    ) -> None:
+        """Send what is shown, the newest picture and pings until the connection ends."""
+        next_ping = 0.0
+        loop = asyncio.get_running_loop()
+        while not self.ws.closed:
+            try:
+                if loop.time() >= next_ping:
+                    next_ping = loop.time() + PING_S
+                    time = self._clock()
+                    await self.ws.send_str(write_ping(self._offset.ping(time), time))
+                await self._send_new(write_shown(self.role), take_picture())
+            except ConnectionError:
+                return
+            await asyncio.sleep(SEND_S)
+
+    async def _send_new(self, shown: list[str], picture: Picture | None) -> None:
+        for text in shown:
+            if text not in self._shown:
+                await self.ws.send_str(text)
+        self._shown = shown
+        # Who still has something to receive gets no picture: it would be old on its arrival.
+        if picture is None or picture is self._picture or not self._is_idle():
+            return
+        self._picture = picture
+        for data in picture.messages:
+            await self.ws.send_bytes(data)
+
+    def _is_idle(self) -> bool:
+        transport = self._transport
+        return transport is not None and transport.get_write_buffer_size() == 0
+
+
+def _limit_buffer(transport: asyncio.Transport | None) -> None:
+    """Let the system hold back little, so that what is unsent can be seen here."""
+    connection = None if transport is None else transport.get_extra_info("socket")
+    option = getattr(socket, "TCP_NOTSENT_LOWAT", None)
+    if connection is not None and option is not None:
+        connection.setsockopt(socket.IPPROTO_TCP, option, UNSENT)

@@ -1,0 +1,293 @@
+"""What the page and the server say to each other, and what its poses mean in our convention.
+
+Everything but pictures is JSON text. A page sends `frame`, `pong`, `wish` and `bye`; the server
+sends `welcome`, `ping`, `display`, `pose` and `refused`, and pictures as a byte with the number of
+the camera followed by a JPEG. `docs/headset.md` holds every field.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from xop_lerobot.operator.devices.axes import WORLD
+from xop_lerobot.operator.display import Display, Wish
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.stream_guard import NORM_TOLERANCE, OPEN_PINCH
+from xop_lerobot.transforms import make_pose, quat_from_matrix, quat_multiply, quat_rotate
+
+VERSION = 1
+PORT = 8012
+MAX_MESSAGE = 8192
+"""Longest message of a page [bytes]."""
+MAX_REASON = 200
+"""Longest reason for a farewell that is passed on [characters]."""
+SOURCES = ("hands", "controllers", "standin")
+GRIP_TO_WRIST = 0.08
+"""From the middle of a fist around a controller back to the wrist [m]."""
+
+# Our axes in those of a joint, as columns. Heads and wrists of WebXR lie as its world does when
+# ours do: x right, y up or out of the back of the hand, z back or away from the fingers.
+_PARALLEL = WORLD.T
+# A grip has z from the thumb along the rod that is held, x out of the back of a right hand and
+# into that of a left one, and y towards the forearm.
+_GRIPS = {
+    "left": np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]),
+    "right": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+}
+_WORLD_QUAT = quat_from_matrix(WORLD)
+_PARALLEL_QUAT = quat_from_matrix(_PARALLEL)
+_GRIP_QUATS = {side: quat_from_matrix(axes) for side, axes in _GRIPS.items()}
+_NOWHERE = np.full(7, np.nan)
+
+
+@dataclass(frozen=True)
+class FrameMessage:
+    """Head and hands of the wearer.
+
+    Attributes:
+        number: Counts up, one page's frames.
+        sent: When it was sent, on the page's clock [s].
+        source: What it was made from, one of `SOURCES`.
+        frame: The same in our convention, at time 0; what is malformed is NaN.
+    """
+
+    number: int
+    sent: float
+    source: str
+    frame: OperatorFrame
+
+
+@dataclass(frozen=True)
+class Pong:
+    """Answer to a ping.
+
+    Attributes:
+        number: That of the ping.
+        sent: When it was answered, on the page's clock [s].
+    """
+
+    number: int
+    sent: float
+
+
+@dataclass(frozen=True)
+class Bye:
+    """The wearer has ended the session, or has taken the headset off.
+
+    Attributes:
+        reason: Why, in words.
+    """
+
+    reason: str
+
+
+Message = FrameMessage | Pong | Wish | Bye
+
+
+def parse_message(text: str) -> Message | str:
+    """Decode what a page has sent.
+
+    Returns:
+        The message; or why it is none, in one word.
+    """
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError):
+        return "no_message"
+    if not isinstance(values, dict):
+        return "no_message"
+    parse = _PARSERS.get(str(values.get("type")))
+    return "no_message" if parse is None else parse(values)
+
+
+def _parse_pong(values: Mapping[str, Any]) -> Pong | str:
+    number, sent = _read_count(values.get("id")), _read_number(values.get("t"))
+    if number is None or not math.isfinite(sent):
+        return "bad_pong"
+    return Pong(number, sent / 1e3)
+
+
+def _parse_wish(values: Mapping[str, Any]) -> Wish | str:
+    try:
+        return Wish(values.get("wish"))
+    except ValueError:
+        return "bad_wish"
+
+
+def _parse_bye(values: Mapping[str, Any]) -> Bye:
+    reason = values.get("reason")
+    return Bye(clean(reason) if isinstance(reason, str) else "")
+
+
+def clean(text: str) -> str:
+    """What of `text` may stand in a log: one line, printable, not too long."""
+    return "".join(c if c.isprintable() else " " for c in text[:MAX_REASON]).strip()
+
+
+def _parse_frame(values: Mapping[str, Any]) -> FrameMessage | str:
+    number, sent = _read_count(values.get("seq")), _read_number(values.get("t"))
+    source = values.get("source")
+    if number is None or not math.isfinite(sent) or source not in SOURCES:
+        return "bad_frame"
+    tracked = np.zeros(3, dtype=bool)
+    head = _NOWHERE
+    if values.get("head") is not None:
+        head, tracked[0] = _to_ours(_read_numbers(values["head"], 7), _PARALLEL_QUAT), True
+    wrists, pinch = [], np.full(2, np.nan)
+    for i, side in enumerate(("left", "right")):
+        hand = values.get(side)
+        wrist = _NOWHERE
+        # A guessed position is no position.
+        if hand is not None and not (isinstance(hand, dict) and hand.get("emulated") is True):
+            wrist, pinch[i] = _read_hand(hand, source, side)
+            tracked[1 + i] = True
+        wrists.append(wrist)
+    return FrameMessage(
+        number, sent / 1e3, source, OperatorFrame(0.0, head, *wrists, pinch, tracked)
+    )
+
+
+_PARSERS: dict[str, Callable[[Mapping[str, Any]], Message | str]] = {
+    "frame": _parse_frame,
+    "pong": _parse_pong,
+    "wish": _parse_wish,
+    "bye": _parse_bye,
+}
+
+
+def _read_hand(hand: Any, source: str, side: str) -> tuple[np.ndarray, float]:
+    """Pose of a wrist, shape (7,), and distance of thumb and index tip [m]; NaN where bad."""
+    if not isinstance(hand, dict):
+        return _NOWHERE, math.nan
+    if source == "controllers":
+        grip = _read_numbers(hand.get("grip"), 7)
+        pose = _to_ours(grip, _GRIP_QUATS[side])
+        # Only finite poses are turned: the rest is left for the guard to count.
+        if np.isfinite(pose).all():
+            pose[:3] -= quat_rotate(pose[3:], np.array([GRIP_TO_WRIST, 0, 0]))
+        trigger = _read_number(hand.get("trigger"))
+        return pose, OPEN_PINCH * (1 - trigger) if 0 <= trigger <= 1 else math.nan
+    pose = _to_ours(_read_numbers(hand.get("wrist"), 7), _PARALLEL_QUAT)
+    if source == "standin":
+        return pose, _read_number(hand.get("pinch"))
+    thumb, index = (_read_numbers(hand.get(tip), 3) for tip in ("thumb", "index"))
+    return pose, math.hypot(*(thumb - index))
+
+
+def _to_ours(theirs: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Pose of ours for x y z qx qy qz qw of WebXR, and our axes in its own, wxyz. Shape (7,)."""
+    position, quat = WORLD @ theirs[:3], theirs[[6, 3, 4, 5]]
+    norm = math.hypot(*quat)
+    if not abs(norm - 1) <= NORM_TOLERANCE:
+        return make_pose(position, quat)  # no rotation, as the guard will say
+    turned = quat_multiply(quat_multiply(_WORLD_QUAT, quat / norm), axes)
+    return make_pose(position, turned)
+
+
+def _read_number(value: Any) -> float:
+    """The finite number `value`, NaN if it is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    try:
+        number = float(value)
+    except OverflowError:
+        return math.nan
+    return number if math.isfinite(number) else math.nan
+
+
+def _read_numbers(values: Any, count: int) -> np.ndarray:
+    """A list of `count` numbers, NaN where it is something else. Shape (count,)."""
+    if not isinstance(values, list) or len(values) != count:
+        return np.full(count, np.nan)
+    return np.array([_read_number(value) for value in values])
+
+
+def _read_count(value: Any) -> int | None:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**53:
+        return None
+    return value
+
+
+def write_welcome(role: str, robot: str, gestures: Mapping[str, str]) -> str:
+    """Write what somebody is told who has come in."""
+    return json.dumps(
+        {
+            "type": "welcome",
+            "role": role,
+            "robot": robot,
+            "gestures": dict(gestures),
+            "version": VERSION,
+        }
+    )
+
+
+def write_ping(number: int, time: float) -> str:
+    """Write a ping of `time` [s] on the server's clock."""
+    return json.dumps({"type": "ping", "id": number, "t": round(time * 1e3, 3)})
+
+
+def write_refused(reason: str) -> str:
+    """Write why the connection is closed."""
+    return json.dumps({"type": "refused", "reason": reason})
+
+
+def write_display(
+    display: Display,
+    warnings: Sequence[str],
+    tracked: np.ndarray,
+    rate: float,
+    delay: float | None,
+) -> str:
+    """Write what is shown.
+
+    Args:
+        display: What the teleoperation says.
+        warnings: All warnings, its own among them.
+        tracked: Whether head, left and right wrist are seen. Shape (3,), bool.
+        rate: Frames in the last second [Hz].
+        delay: Delay of the frames [s], None while it is not known.
+    """
+    progress = display.progress
+    return json.dumps(
+        {
+            "type": "display",
+            "time": round(display.time, 3),
+            "engaged": display.engaged,
+            "mode": display.mode.name.lower(),
+            "clutch": round(display.clutch, 3),
+            "holding": display.holding,
+            "notices": [
+                {"number": notice.number, "cue": notice.cue.value, "text": notice.text}
+                for notice in display.notices
+            ],
+            "warnings": list(warnings),
+            "fallen": display.fallen,
+            "progress": None
+            if progress is None
+            else {
+                "episode": progress.episode,
+                "frames": progress.frames,
+                "seconds": round(progress.seconds, 2),
+                "success": progress.success,
+            },
+            "delay_ms": None if delay is None else round(delay * 1e3, 1),
+            "tracked": [bool(seen) for seen in tracked],
+            "rate": round(rate, 1),
+        }
+    )
+
+
+def write_pose(frame: OperatorFrame) -> str:
+    """Write head and wrists for those who look on: x y z qw qx qy qz, null where not seen."""
+    names = ("head", "left_wrist", "right_wrist")
+    poses = [
+        [round(float(x), 4) for x in frame.pose(name)] if seen else None
+        for name, seen in zip(names, frame.tracked, strict=True)
+    ]
+    return json.dumps({"type": "pose", "head": poses[0], "left": poses[1], "right": poses[2]})

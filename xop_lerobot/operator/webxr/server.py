@@ -1,0 +1,289 @@
+"""The one port of a WebXR headset: its page, its certificate and its WebSocket."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import ssl
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Protocol
+from urllib.parse import urlsplit
+
+from aiohttp import WSMsgType, web
+
+from xop_lerobot.operator.display import Wish
+from xop_lerobot.operator.webxr.client import Client
+from xop_lerobot.operator.webxr.pairing import Door
+from xop_lerobot.operator.webxr.pictures import Picture
+from xop_lerobot.operator.webxr.protocol import (
+    MAX_MESSAGE,
+    Bye,
+    FrameMessage,
+    Pong,
+    parse_message,
+    write_refused,
+    write_welcome,
+)
+
+logger = logging.getLogger(__name__)
+
+PAGE = Path(__file__).parent / "page"
+MAX_MONITORS = 4
+IDLE_S = 5.0
+"""An operator that sends no frame for so long makes room for the next [s]."""
+HEARTBEAT_S = 3.0
+"""Clients that answer nothing for so long are let go [s]."""
+CLOSE_S = 2.0
+"""How long a farewell may take [s]."""
+DRIVES = "somebody drives already; wait until they have left, or open the page as a monitor"
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Permissions-Policy": "xr-spatial-tracking=(self)",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+_KINDS = {
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+}
+
+
+class Wearer(Protocol):
+    """What the server serves: a `WebXrDevice`. All of it is called on the server's thread."""
+
+    def clock(self) -> float:
+        """Time [s]."""
+        ...
+
+    @property
+    def introduction(self) -> tuple[str, dict[str, str]]:
+        """The robot's name, and what the gestures do, by name."""
+        ...
+
+    def take(self, message: FrameMessage, client: Client) -> None:
+        """Take a frame of the operator."""
+        ...
+
+    def refuse(self, reason: str) -> None:
+        """Count a message that holds no frame."""
+        ...
+
+    def wish(self, wish: Wish) -> None:
+        """Take what the operator wants of the recording."""
+        ...
+
+    def leave(self, reason: str) -> None:
+        """Take note that the operator is gone."""
+        ...
+
+    def write_shown(self, role: str) -> list[str]:
+        """What is to be shown now, as messages."""
+        ...
+
+    def take_picture(self) -> Picture | None:
+        """The newest picture."""
+        ...
+
+
+class HeadsetServer:
+    """Serves one operator and a few monitors until it is told to stop.
+
+    Args:
+        wearer: Whom it serves.
+        code: The pairing code.
+        certificate: Certificate for download, None without TLS.
+        tls: Context of TLS, None without.
+    """
+
+    def __init__(
+        self,
+        wearer: Wearer,
+        code: str,
+        certificate: Path | None = None,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        self._wearer, self._door = wearer, Door(code)
+        self._certificate, self._tls = certificate, tls
+        self._operator: Client | None = None
+        self._clients: set[Client] = set()
+        self._farewells: set[asyncio.Task[None]] = set()
+
+    async def run(self, listener: socket.socket, stop: asyncio.Event) -> None:
+        """Serve at `listener`, which is closed in the end, until `stop` is set."""
+        app = web.Application(client_max_size=0, middlewares=[_add_headers])
+        app.router.add_get("/", self._send_page)
+        app.router.add_get("/cert", self._send_certificate)
+        app.router.add_get("/ws", self._serve_socket)
+        app.router.add_get("/{name}", self._send_page)
+        runner = web.AppRunner(
+            app,
+            access_log=None,
+            handle_signals=False,
+            keepalive_timeout=10.0,
+            shutdown_timeout=CLOSE_S,
+        )
+        await runner.setup()
+        try:
+            await web.SockSite(runner, listener, ssl_context=self._tls).start()
+            await stop.wait()
+        finally:
+            for client in list(self._clients):
+                await self._dismiss(client, "the session has ended")
+            await runner.cleanup()
+
+    async def _send_page(self, request: web.Request) -> web.StreamResponse:
+        name = request.match_info.get("name", "index.html")
+        path = PAGE / name
+        # Only files that lie in the folder itself: the name has no slash, and is no other way out.
+        if path.parent != PAGE or path.suffix not in _KINDS or not path.is_file():
+            raise web.HTTPNotFound
+        return web.Response(body=path.read_bytes(), content_type=_KINDS[path.suffix])
+
+    async def _send_certificate(self, request: web.Request) -> web.StreamResponse:
+        del request
+        if self._certificate is None:
+            raise web.HTTPNotFound(text="There is no certificate: this page is served without TLS.")
+        return web.Response(
+            body=self._certificate.read_bytes(),
+            content_type="application/x-x509-ca-cert",
+            headers={"Content-Disposition": 'attachment; filename="xop-lerobot.crt"'},
+        )
+
+    async def _serve_socket(self, request: web.Request) -> web.StreamResponse:
+        if not _is_own_page(request):
+            raise web.HTTPForbidden(text="Only this server's own page may come in.")
+        role = request.query.get("role", "operator")
+        address = request.remote or "?"
+        ws = web.WebSocketResponse(
+            max_msg_size=2 * MAX_MESSAGE, compress=False, heartbeat=HEARTBEAT_S, timeout=CLOSE_S
+        )
+        await ws.prepare(request)
+        client = Client(ws, request, role, self._wearer.clock)
+        reason = self._door.refuse(address, request.query.get("code", ""), self._wearer.clock())
+        if reason is not None:
+            logger.warning("WebXR: %s was refused: %s.", address, reason)
+        else:
+            reason = await self._find_no_room(client)
+        if reason is not None:
+            await self._dismiss(client, reason)
+            return ws
+        self._clients.add(client)
+        logger.info(
+            "WebXR: %s has come in from %s.",
+            "the operator" if role == "operator" else "a monitor",
+            address,
+        )
+        sender = asyncio.create_task(
+            client.send_on(self._wearer.write_shown, self._wearer.take_picture)
+        )
+        try:
+            await ws.send_str(write_welcome(role, *self._wearer.introduction))
+            await self._listen(client)
+        except (ConnectionError, asyncio.CancelledError):
+            pass
+        finally:
+            sender.cancel()
+            self._clients.discard(client)
+            self._forget(client, "the connection was closed")
+        return ws
+
+    async def _find_no_room(self, client: Client) -> str | None:
+        """Why there is no room for `client`, None if there is; it has it then."""
+        if client.role == "monitor":
+            monitors = sum(other.role == "monitor" for other in self._clients)
+            return (
+                f"too many monitors; {MAX_MONITORS} may look on"
+                if monitors >= MAX_MONITORS
+                else None
+            )
+        if client.role != "operator":
+            return "role must be operator or monitor"
+        other = self._operator
+        if other is not None and self._wearer.clock() - other.active_at <= IDLE_S:
+            return DRIVES
+        if other is not None:
+            self._forget(other, "somebody has taken over")
+            farewell = asyncio.create_task(self._dismiss(other, "somebody has taken over"))
+            self._farewells.add(farewell)
+            farewell.add_done_callback(self._farewells.discard)
+        self._operator = client
+        return None
+
+    async def _listen(self, client: Client) -> None:
+        """Take what `client` sends until it leaves or does what it may not."""
+        async for message in client.ws:
+            if message.type is not WSMsgType.TEXT:
+                await self._dismiss(client, "only text is taken here")
+                return
+            reason = self._take(client, message.data)
+            if reason is not None:
+                logger.warning("WebXR: the connection was closed: %s.", reason)
+                await self._dismiss(client, reason)
+                return
+
+    def _take(self, client: Client, text: str) -> str | None:
+        """Take one message; return why the connection ends, None if it goes on."""
+        if client.rate.is_broken(asyncio.get_running_loop().time()):
+            return "too many messages"
+        if len(text.encode()) > MAX_MESSAGE:
+            self._wearer.refuse("too_long")
+            return f"a message may have {MAX_MESSAGE} bytes"
+        message = parse_message(text)
+        if isinstance(message, Pong):
+            client.take_pong(message)
+            return None
+        if isinstance(message, Wish):  # of whoever stands by, too
+            self._wearer.wish(message)
+        elif client is not self._operator:
+            return "monitors look on"
+        elif isinstance(message, str):
+            self._wearer.refuse(message)
+        elif isinstance(message, FrameMessage):
+            client.active_at = self._wearer.clock()
+            self._wearer.take(message, client)
+        elif isinstance(message, Bye):
+            self._wearer.leave(message.reason or "the session in the headset has ended")
+        return None
+
+    async def _dismiss(self, client: Client, reason: str) -> None:
+        """Tell a client why, and close its connection."""
+        self._forget(client, reason)
+        try:
+            async with asyncio.timeout(CLOSE_S):
+                await client.ws.send_str(write_refused(reason))
+                await client.ws.close(code=1008, message=reason.encode()[:120])
+        except (TimeoutError, ConnectionError):
+            client.abort()
+
+    def _forget(self, client: Client, reason: str) -> None:
+        if client is self._operator:
+            self._operator = None
+            self._wearer.leave(reason)
+
+
+def _is_own_page(request: web.Request) -> bool:
+    """Whether it was no page of another site that opened the connection."""
+    origin = request.headers.get("Origin")
+    return origin is None or urlsplit(origin).netloc == request.host
+
+
+@web.middleware
+async def _add_headers(
+    request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+) -> web.StreamResponse:
+    try:
+        response = await handler(request)
+    except web.HTTPException as error:
+        error.headers.update(HEADERS)
+        raise
+    if not response.prepared:
+        response.headers.update(HEADERS)
+    return response
