@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -10,6 +9,7 @@ from collections.abc import Callable
 import grpc
 
 from xop_lerobot.errors import BadValue
+from xop_lerobot.operator.devices.address import find_own_address
 from xop_lerobot.operator.devices.avp_protocol import METHOD, PORT, make_request, parse_update
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.live import LiveDevice, StreamLost
@@ -84,17 +84,6 @@ class AvpDevice(LiveDevice):
         with self._call_lock:
             if self._call is not None:
                 self._call.cancel()
-
-
-def find_own_address(target: str) -> str:
-    """Our own IPv4 address on the way to `target` (host:port); nothing is sent."""
-    host, _, port = target.rpartition(":")
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect((host, int(port)))
-            return str(probe.getsockname()[0])
-    except OSError:
-        return "0.0.0.0"  # the connection will fail too, and say why
 
 
 def _describe(error: grpc.RpcError) -> str:

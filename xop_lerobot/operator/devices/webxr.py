@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
+import dataclasses
 import logging
 import socket
-import statistics
+import sys
 import threading
 import time
 from collections import deque
@@ -16,10 +16,14 @@ import numpy as np
 
 from xop_lerobot.errors import BadValue, XopError
 from xop_lerobot.operator.devices.config import DeviceConfig
-from xop_lerobot.operator.devices.live import RATE_WINDOW_S, SILENT_S, LiveDevice, StreamStatus
+from xop_lerobot.operator.devices.live import SILENT_S, LiveDevice, StreamStatus
 from xop_lerobot.operator.display import Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.webxr.addresses import is_loopback, make_url
+from xop_lerobot.operator.webxr.certificate import Certificate, get_certificate
 from xop_lerobot.operator.webxr.client import Client
+from xop_lerobot.operator.webxr.delay_meter import DelayMeter
+from xop_lerobot.operator.webxr.invitation import list_hosts, write_invitation
 from xop_lerobot.operator.webxr.pairing import check_code, make_code
 from xop_lerobot.operator.webxr.pictures import Picture, PictureEncoder
 from xop_lerobot.operator.webxr.protocol import PORT, FrameMessage, write_display, write_pose
@@ -57,12 +61,14 @@ class WebXrDevice(LiveDevice):
                 f"device.tls=false needs a host that only this machine reaches, got {self.host!r}; "
                 "headsets ask for TLS anyway"
             )
+        self.certificate: Certificate | None = None
         self.introduction: tuple[str, dict[str, str]] = ("", {})
         self._pictures = PictureEncoder()
         self._display: Display | None = None
         self._read: OperatorFrame | None = None
         self._wishes: deque[Wish] = deque(maxlen=8)
-        self._delays: deque[tuple[float, float]] = deque()
+        self._delay = DelayMeter(config.max_delay_s)
+        self._was_late = False
         self._listener: socket.socket | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_stop: asyncio.Event | None = None
@@ -75,22 +81,28 @@ class WebXrDevice(LiveDevice):
 
     @property
     def url(self) -> str:
-        """Address of the page on this machine, without the code."""
-        host = "localhost" if self.host in (LOOPBACK, "0.0.0.0", "::") else self.host
-        return f"{'https' if self.tls else 'http'}://{host}:{self.port}/"
+        """Address of the page, without the code."""
+        return make_url("https" if self.tls else "http", list_hosts(self.host)[0], self.port)
 
     def connect(self) -> None:
         """Listen, and return at once: the person may put the headset on later.
 
         Raises:
             PortTaken: If the port cannot be listened at.
+            CertificateFault: If there is no certificate, and none can be made.
         """
         if self._thread is not None:
             return
+        self.certificate = get_certificate() if self.tls else None
         self._listener = listen(self.host, self.port)
         self._pictures.start()
-        logger.info("Open %s?code=%s", self.url, self.code)
+        self._invite()
         super().connect()
+
+    def _invite(self) -> None:
+        fingerprint = self.certificate.fingerprint if self.certificate is not None else ""
+        qr = sys.stdout.isatty()
+        print(write_invitation(self.host, self.port, self.tls, self.code, fingerprint, qr))
 
     def disconnect(self) -> None:
         """Dismiss everybody and close the port; may be called twice."""
@@ -132,15 +144,11 @@ class WebXrDevice(LiveDevice):
     @property
     def status(self) -> StreamStatus:
         """How the stream is doing now."""
+        status = super().status
         with self._lock:
             now = self.clock()
-            while self._delays and self._delays[0][0] < now - RATE_WINDOW_S:
-                self._delays.popleft()
-            delays = [delay for _, delay in self._delays]
-        status = super().status
-        return StreamStatus(
-            **{**vars(status), "delay": statistics.median(delays) if delays else None}
-        )
+            delay, trouble = self._delay.measure(now), self._delay.describe(now)
+        return dataclasses.replace(status, delay=delay, trouble=status.trouble or trouble)
 
     # -- the server's side -----------------------------------------------------------------
 
@@ -157,7 +165,7 @@ class WebXrDevice(LiveDevice):
             stop.set()
         try:
             listener = listener or listen(self.host, self.port)
-            await HeadsetServer(self, self.code).run(listener, stop)
+            await HeadsetServer(self, self.code, self.certificate).run(listener, stop)
         finally:
             with self._loop_lock:
                 self._loop = self._loop_stop = None
@@ -179,14 +187,20 @@ class WebXrDevice(LiveDevice):
         if measured is None:
             self.refuse("clock_unknown")
             return
+        if not self._connected:
+            with self._lock:
+                self._delay.reset()
         self.hear()
-        delay, error = measured
         with self._lock:
-            self._delays.append((now, delay))
-        if delay + error > self.config.max_delay_s:
+            late = self._delay.take(now, *measured)
+            trouble = self._delay.describe(now) if late and not self._was_late else ""
+        if trouble:
+            logger.warning(trouble)
+        self._was_late = late
+        if late:
             self.refuse("late")
-            return
-        self.receive(message.frame, message.sent)
+        else:
+            self.receive(message.frame, message.sent)
 
     def wish(self, wish: Wish) -> None:
         """Take what the operator wants of the recording."""
@@ -207,14 +221,6 @@ class WebXrDevice(LiveDevice):
     def take_picture(self) -> Picture | None:
         """The newest picture."""
         return self._pictures.newest
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches `host`."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def listen(host: str, port: int) -> socket.socket:

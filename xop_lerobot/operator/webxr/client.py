@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 from collections.abc import Callable
 
@@ -12,6 +13,8 @@ from xop_lerobot.operator.webxr.clock_offset import ClockOffset
 from xop_lerobot.operator.webxr.pairing import RateLimit
 from xop_lerobot.operator.webxr.pictures import Picture
 from xop_lerobot.operator.webxr.protocol import FrameMessage, Pong, write_ping
+
+logger = logging.getLogger(__name__)
 
 SEND_S = 0.05
 """Period of what is shown [s]."""
@@ -84,6 +87,10 @@ class Client:
                     await self.ws.send_str(write_ping(self._offset.ping(time), time))
                 await self._send_new(write_shown(self.role), take_picture())
             except ConnectionError:
+                return
+            except Exception:
+                logger.exception("what is shown cannot be sent; the page will connect anew")
+                self.abort()
                 return
             await asyncio.sleep(SEND_S)
 

@@ -7,6 +7,7 @@ the camera followed by a JPEG. `docs/headset.md` holds every field.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -268,14 +269,7 @@ def write_display(
             ],
             "warnings": list(warnings),
             "fallen": display.fallen,
-            "progress": None
-            if progress is None
-            else {
-                "episode": progress.episode,
-                "frames": progress.frames,
-                "seconds": round(progress.seconds, 2),
-                "success": progress.success,
-            },
+            "progress": None if progress is None else dataclasses.asdict(progress),
             "delay_ms": None if delay is None else round(delay * 1e3, 1),
             "tracked": [bool(seen) for seen in tracked],
             "rate": round(rate, 1),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-import ssl
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Protocol
@@ -14,6 +13,7 @@ from urllib.parse import urlsplit
 from aiohttp import WSMsgType, web
 
 from xop_lerobot.operator.display import Wish
+from xop_lerobot.operator.webxr.certificate import Certificate
 from xop_lerobot.operator.webxr.client import Client
 from xop_lerobot.operator.webxr.pairing import Door
 from xop_lerobot.operator.webxr.pictures import Picture
@@ -99,19 +99,17 @@ class HeadsetServer:
     Args:
         wearer: Whom it serves.
         code: The pairing code.
-        certificate: Certificate for download, None without TLS.
-        tls: Context of TLS, None without.
+        certificate: That of this machine, None without TLS.
     """
 
     def __init__(
         self,
         wearer: Wearer,
         code: str,
-        certificate: Path | None = None,
-        tls: ssl.SSLContext | None = None,
+        certificate: Certificate | None = None,
     ) -> None:
         self._wearer, self._door = wearer, Door(code)
-        self._certificate, self._tls = certificate, tls
+        self._certificate = certificate
         self._operator: Client | None = None
         self._clients: set[Client] = set()
         self._farewells: set[asyncio.Task[None]] = set()
@@ -132,7 +130,8 @@ class HeadsetServer:
         )
         await runner.setup()
         try:
-            await web.SockSite(runner, listener, ssl_context=self._tls).start()
+            tls = None if self._certificate is None else self._certificate.make_context()
+            await web.SockSite(runner, listener, ssl_context=tls).start()
             await stop.wait()
         finally:
             for client in list(self._clients):
@@ -152,7 +151,7 @@ class HeadsetServer:
         if self._certificate is None:
             raise web.HTTPNotFound(text="There is no certificate: this page is served without TLS.")
         return web.Response(
-            body=self._certificate.read_bytes(),
+            body=self._certificate.path.read_bytes(),
             content_type="application/x-x509-ca-cert",
             headers={"Content-Disposition": 'attachment; filename="xop-lerobot.crt"'},
         )

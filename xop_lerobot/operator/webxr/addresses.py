@@ -1,0 +1,58 @@
+"""By which names and addresses other machines reach this one."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+
+import psutil
+
+from xop_lerobot.operator.devices.address import find_own_address
+
+LOOPBACKS = ("127.0.0.1", "::1")
+ANY = ("0.0.0.0", "::")
+"""Listening there is listening at every address."""
+OUTSIDE = "192.0.2.1:9"
+"""Reserved for documentation: nobody is there, but the way to it begins in the usual network."""
+
+
+def list_addresses() -> list[str]:
+    """Addresses of this machine in its networks, that of the usual way out first.
+
+    Addresses that hold for one cable alone (link-local) and loopback are left out.
+    """
+    found = set()
+    for entries in psutil.net_if_addrs().values():
+        for entry in entries:
+            if entry.family in (socket.AF_INET, socket.AF_INET6):
+                address = ipaddress.ip_address(entry.address.partition("%")[0])
+                if not (address.is_loopback or address.is_link_local):
+                    found.add(address)
+    usual = find_own_address(OUTSIDE)
+    ordered = sorted(found, key=lambda a: (str(a) != usual, a.version, int(a)))
+    return [str(address) for address in ordered]
+
+
+def list_names() -> list[str]:
+    """Names of this machine: its own, the same as neighbours know it, and localhost."""
+    name = socket.gethostname().lower().partition(".")[0]
+    own = [name, f"{name}.local"] if _is_name(name) else []
+    return [*own, "localhost"]
+
+
+def _is_name(name: str) -> bool:
+    return name.isascii() and 0 < len(name) < 64 and name.replace("-", "").isalnum()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches `host`."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def make_url(scheme: str, host: str, port: int, code: str = "") -> str:
+    """Address of a page."""
+    shown = f"[{host}]" if ":" in host else host
+    return f"{scheme}://{shown}:{port}/{f'?code={code}' if code else ''}"

@@ -1,0 +1,234 @@
+"""The certificate of this machine, made when it is first needed; browsers ask for one.
+
+It signs itself, is valid for the machine's own names and addresses alone, and never leaves the
+user's own folder but for its public half.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import fcntl
+import ipaddress
+import logging
+import os
+import ssl
+import stat
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from xop_lerobot.errors import XopError
+from xop_lerobot.operator.webxr.addresses import LOOPBACKS, list_addresses, list_names
+
+logger = logging.getLogger(__name__)
+
+VALID = datetime.timedelta(days=397)
+"""Apple's systems believe none that is valid for longer."""
+RENEW = datetime.timedelta(days=30)
+"""It is renewed so long before its end."""
+SKEW = datetime.timedelta(hours=1)
+"""The clock of a headset may be so late."""
+MAX_NAMES = 64
+
+
+class CertificateFault(XopError):
+    """The certificate cannot be made or read; the message names the folder."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A certificate and its key.
+
+    Attributes:
+        path: File of the certificate (PEM).
+        key_path: File of its private key (PEM), which its user alone can read.
+        names: Names and addresses that it is valid for.
+        end: When it ends.
+        fingerprint: SHA-256 of it, in pairs of digits, as browsers show it.
+    """
+
+    path: Path
+    key_path: Path
+    names: frozenset[str]
+    end: datetime.datetime
+    fingerprint: str
+
+    def make_context(self) -> ssl.SSLContext:
+        """Make the context of a server."""
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.load_cert_chain(self.path, self.key_path)
+        return context
+
+
+def find_folder() -> Path:
+    """The folder of the certificate."""
+    base = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    return Path(base) / "xop-lerobot"
+
+
+def list_own_names() -> frozenset[str]:
+    """Everything that this machine is called now."""
+    return frozenset([*list_names(), *LOOPBACKS, *list_addresses()][:MAX_NAMES])
+
+
+def get_certificate(
+    folder: Path | None = None,
+    names: Iterable[str] | None = None,
+    now: datetime.datetime | None = None,
+) -> Certificate:
+    """Return this machine's certificate; make it where there is none that will do.
+
+    A new one is made when a name or an address is not in it, when it ends within 30 days, when
+    it does not belong to its key, and when others could have read the key.
+
+    Args:
+        folder: Where it is kept; None for the user's own folder.
+        names: What it must be valid for; None for all that this machine is called.
+        now: The time; None for the present.
+
+    Raises:
+        CertificateFault: If the folder cannot be used.
+    """
+    folder = folder or find_folder()
+    names = list_own_names() if names is None else frozenset(names)
+    now = now or datetime.datetime.now(datetime.UTC)
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with _hold(folder):
+            found, fault = inspect_certificate(folder, names, now)
+            if found is None:
+                logger.info("A new certificate is made in %s: %s.", folder, fault)
+                _write(folder, names, now)
+                found, fault = inspect_certificate(folder, names, now)
+    except OSError as error:
+        raise CertificateFault(f"certificate in '{folder}': {error.strerror or error}") from error
+    if found is None:
+        raise CertificateFault(f"certificate in '{folder}': {fault}")
+    return found
+
+
+def inspect_certificate(
+    folder: Path, names: frozenset[str], now: datetime.datetime
+) -> tuple[Certificate | None, str]:
+    """Return the certificate of a folder, or None and what is wrong with it; changes nothing."""
+    path, key_path = folder / "webxr.crt", folder / "webxr.key"
+    if not (path.exists() and key_path.exists()):
+        return None, "there is none yet"
+    if key_path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        return None, "others could read its key"
+    try:
+        parsed = x509.load_pem_x509_certificate(path.read_bytes())
+        key = serialization.load_pem_private_key(key_path.read_bytes(), password=None)
+        held = _read_names(parsed)
+    except (ValueError, TypeError, x509.ExtensionNotFound):
+        return None, "it cannot be read"
+    end = parsed.not_valid_after_utc
+    fault = ""
+    if key.public_key() != parsed.public_key():
+        fault = "it does not belong to its key"
+    elif not parsed.not_valid_before_utc <= now < end - RENEW:
+        fault = f"the old one ends on {end:%Y-%m-%d}"
+    elif names - held:
+        fault = f"the old one does not hold {', '.join(sorted(names - held))}"
+    digest = parsed.fingerprint(hashes.SHA256()).hex(":").upper()
+    return None if fault else Certificate(path, key_path, held, end, digest), fault
+
+
+def _read_names(parsed: x509.Certificate) -> frozenset[str]:
+    held = parsed.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    addresses = held.get_values_for_type(x509.IPAddress)
+    return frozenset([*held.get_values_for_type(x509.DNSName), *map(str, addresses)])
+
+
+def _write(folder: Path, names: frozenset[str], now: datetime.datetime) -> None:
+    key = ec.generate_private_key(ec.SECP256R1())
+    made = _sign(key, names, now)
+    secret = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    _replace(folder / "webxr.key", secret, 0o600)
+    _replace(folder / "webxr.crt", made.public_bytes(serialization.Encoding.PEM), 0o644)
+
+
+def _sign(
+    key: ec.EllipticCurvePrivateKey, names: frozenset[str], now: datetime.datetime
+) -> x509.Certificate:
+    addresses = [ipaddress.ip_address(name) for name in sorted(names) if _is_address(name)]
+    hosts = [name for name in sorted(names) if not _is_address(name)]
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "xop-lerobot (this machine)")])
+    usage = x509.KeyUsage(
+        digital_signature=True,
+        key_cert_sign=True,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        crl_sign=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    # Headsets of Apple let their wearer trust authorities alone, so it is one; its constraints
+    # keep it from vouching for anything but this machine.
+    constraints = x509.NameConstraints(
+        permitted_subtrees=[
+            *map(x509.DNSName, hosts),
+            *(x509.IPAddress(ipaddress.ip_network(address)) for address in addresses),
+        ],
+        excluded_subtrees=None,
+    )
+    alternatives = [*map(x509.DNSName, hosts), *map(x509.IPAddress, addresses)]
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - SKEW)
+        .not_valid_after(now - SKEW + VALID)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(constraints, critical=True)
+        .add_extension(usage, critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .add_extension(x509.SubjectAlternativeName(alternatives), critical=False)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _replace(path: Path, data: bytes, mode: int) -> None:
+    """Write a file at once, which nobody else may read before it has its mode."""
+    handle, name = tempfile.mkstemp(dir=path.parent)  # mode 0600
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            os.fchmod(file.fileno(), mode)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def _hold(folder: Path) -> Iterator[None]:
+    """Let one process at a time make a certificate."""
+    with (folder / "webxr.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

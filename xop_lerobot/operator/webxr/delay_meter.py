@@ -1,0 +1,76 @@
+"""How old the frames of a headset are when they arrive, and what to say about it."""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+
+WINDOW_S = 1.0
+"""Time over which the delay is taken [s]."""
+SLOW_S = 0.15
+"""Who drives with a delay of more than this feels it [s]."""
+GROWN_S = 0.08
+"""So much over the smallest delay of the connection, it has grown [s]."""
+
+
+class DelayMeter:
+    """The delay of the last second.
+
+    Args:
+        limit: Frames that are older on arrival are dropped [s].
+    """
+
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+        self._frames: deque[tuple[float, float, bool]] = deque()
+        self._smallest = float("inf")
+
+    def reset(self) -> None:
+        """Forget everything, as after a new connection."""
+        self._frames.clear()
+        self._smallest = float("inf")
+
+    def take(self, time: float, delay: float, error: float) -> bool:
+        """Take a frame.
+
+        Args:
+            time: When it came [s].
+            delay: How old it was [s].
+            error: How far that may be off [s].
+
+        Returns:
+            Whether it is too late to be used, or may be.
+        """
+        late = delay + error > self._limit
+        self._frames.append((time, delay, late))
+        self._forget(time)
+        self._smallest = min(self._smallest, statistics.median(d for _, d, _ in self._frames))
+        return late
+
+    def _forget(self, time: float) -> None:
+        while self._frames and self._frames[0][0] < time - WINDOW_S:
+            self._frames.popleft()
+
+    def measure(self, time: float) -> float | None:
+        """Median of the delays in the second before `time` [s]; None without a frame."""
+        self._forget(time)
+        return statistics.median(d for _, d, _ in self._frames) if self._frames else None
+
+    def describe(self, time: float) -> str:
+        """What is wrong with the delay, in words; empty if nothing is."""
+        delay = self.measure(time)
+        if delay is None:
+            return ""
+        if self._frames[-1][2]:
+            return (
+                f"the headset's stream is {delay * 1e3:.0f} ms late and is not followed beyond "
+                f"{self._limit * 1e3:.0f} ms: free the network, or raise device.max_delay_s"
+            )
+        if delay > SLOW_S:
+            return f"the headset's stream is {delay * 1e3:.0f} ms late: move slowly"
+        if delay > self._smallest + GROWN_S:
+            return (
+                f"the delay of the headset's stream has grown from {self._smallest * 1e3:.0f} to "
+                f"{delay * 1e3:.0f} ms"
+            )
+        return ""
