@@ -312,7 +312,7 @@ def test_a_later_refusal_is_waited_out(rig, caplog):
     r.run(0.2)
     r.person.motion = lambda t: make_frame(t, (0, 0, 0.3))
     assert not any(record.engaged for _, record in r.run(0.4))
-    told = [r.message[:13] for r in caplog.records if r.name == "xop_lerobot.teleoperation"]
+    told = [r.message[:13] for r in caplog.records if r.name == "xop_lerobot.operator.engagement"]
     assert told == ["cannot engage"]
     r.person.motion = stand
     assert r.tick()[1].engaged

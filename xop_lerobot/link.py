@@ -8,16 +8,15 @@ for the recorder. Publishing replaces one immutable value, so readers need no lo
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from xop_lerobot.errors import LinkError
-from xop_lerobot.operator.display import Progress, Wish
+from xop_lerobot.operator.display import Cue, Progress, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.view import View
 from xop_lerobot.state import Goal, RobotState
@@ -101,6 +100,18 @@ class Outcome:
     done: bool
 
 
+class Recorder(Protocol):
+    """Who records the session."""
+
+    def grant(self, wish: Wish) -> tuple[Cue, str]:
+        """Do what the operator asks for; return what the operator is told."""
+        ...
+
+    def pause(self, events: MutableMapping[str, bool]) -> None:
+        """Take note that the pause after an episode begins, with the events of its loop."""
+        ...
+
+
 class Session:
     """One robot and one teleoperator.
 
@@ -115,6 +126,7 @@ class Session:
         reset_count: Number of robot resets so far; a change tells the teleoperator to re-align.
         pictures: What the robot's cameras saw last, by name.
         progress: How far the recording is, None where nothing is recorded.
+        recorder: Who records, None where nobody does.
         configs: Resolved configuration of each part (`robot`, `teleop`), saved with a dataset.
     """
 
@@ -132,7 +144,7 @@ class Session:
         self.reset_count = 0
         self.pictures: Mapping[str, np.ndarray] = {}
         self.progress: Progress | None = None
-        self._wishes: deque[Wish] = deque(maxlen=8)
+        self.recorder: Recorder | None = None
         self.configs: dict[str, Any] = {}
 
     def announce(self, info: RobotInfo) -> None:
@@ -148,7 +160,7 @@ class Session:
             if not self._robots:
                 self._forget()
                 self.episode, self._reset_asked = 0, False
-                self.progress = None
+                self.progress = self.recorder = None
 
     def begin_episode(self, index: int) -> None:
         """Ask the robot to start over as episode `index`, in its next `get_observation`."""
@@ -165,20 +177,15 @@ class Session:
         self._forget()
         self.reset_count += 1
 
-    def ask(self, wish: Wish) -> None:
-        """Ask the recorder for `wish`, which it grants with its next frame."""
-        self._wishes.append(wish)
-
-    def take_wishes(self) -> tuple[Wish, ...]:
-        """What was asked for since the last call; the recorder alone calls this."""
-        wishes = tuple(self._wishes)
-        self._wishes.clear()
-        return wishes
+    def ask(self, wish: Wish) -> tuple[Cue, str]:
+        """Ask the recorder for `wish`; return what the operator is told."""
+        if self.recorder is None:
+            return Cue.REFUSED, "Nothing is recorded."
+        return self.recorder.grant(wish)
 
     def _forget(self) -> None:
         self.state = self.tick = self.outcome = self.view = self.obstacles = None
         self.pictures = {}
-        self._wishes.clear()
 
     @property
     def robot(self) -> RobotInfo:

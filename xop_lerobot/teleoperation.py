@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,15 +14,18 @@ from xop_lerobot.errors import XopError
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.operator.alignment import Alignment, AlignmentConfig, EngageRefused, is_lost
-from xop_lerobot.operator.clutch import Clutch, Wish
+from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
+from xop_lerobot.operator.clutch import Clutch
 from xop_lerobot.operator.devices import DeviceConfig, make_device
-from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress
-from xop_lerobot.operator.display import Wish as EpisodeWish
+from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, Wish
+from xop_lerobot.operator.engagement import Engagement
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.gestures import Gesture, GestureConfig, GestureReader, grip_from_pinch
+from xop_lerobot.operator.gestures import GestureConfig, grip_from_pinch
 from xop_lerobot.operator.goal_velocity import GoalVelocity
 from xop_lerobot.operator.hand_blend import HandBlend
+from xop_lerobot.operator.hands import Hands
+from xop_lerobot.operator.raised_hands import HOLDING
+from xop_lerobot.operator.telling import tell_changes
 from xop_lerobot.operator.view import View
 from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.retarget.arm_driver import ArmDriver
@@ -39,8 +41,6 @@ from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.retarget.smoothing import CommandSmoother
 from xop_lerobot.retarget.state_sync import StateSync, Synced
 from xop_lerobot.state import Goal, RobotState
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -63,11 +63,10 @@ class TeleoperationConfig:
 class Teleoperation:
     """One operator drives one robot: `step` turns a robot state into an action.
 
-    While nobody is engaged, the robot is asked to hold the posture it is in. A device that
-    engages by itself does so as soon as the robot has settled; loss of the head's tracking ends
-    an engagement, and the next one aligns anew, so no command ever makes a step. Who wears a
-    headset engages, and lets go, by the gesture of the clutch. A fall ends an engagement
-    too, and nobody engages while the robot counts as fallen. `change` changes settings meanwhile.
+    While nobody is engaged (`Engagement`), the robot is asked to hold the posture it is in; the
+    next engagement aligns anew, so no command ever makes a step. `change` changes settings
+    meanwhile. What the operator asks of the recording is there in `take_wishes`, and the answer
+    is given with `answer`.
 
     Args:
         config: Its parts.
@@ -92,34 +91,35 @@ class Teleoperation:
         self._follower = PlanFollower(
             self.retargeter, self.morphology, self.dt, realtime=info.realtime
         )
-        self.alignment = Alignment(config.alignment)
         self._velocity = GoalVelocity()
-        self._gestures = GestureReader(config.gestures)
-        # Recordings and scripts engage by themselves, and replay as they were recorded.
         has_person = not self.device.self_engaging
-        self._clutch = Clutch(config.gestures.clutch) if has_person else None
+        self._hands = Hands(config.gestures, has_person=has_person)
         self._blend = HandBlend() if has_person else None
+        self._board = NoticeBoard()
+        self._engagement = Engagement(
+            self.device,
+            Alignment(config.alignment),
+            Clutch(config.gestures.clutch) if has_person else None,
+            self._board,
+            begin=self._begin_engagement,
+            end=self._end_engagement,
+        )
         self._sync = StateSync(self.morphology, model) if config.retargeter.sync else None
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
         self._arms = ArmDriver(self.morphology, holds_place=self.retargeter.holds_place)
         self._smoother = CommandSmoother(self.morphology.command_space, self.dt)
-        self._was_engaged = False
-        self._board = NoticeBoard()
         self._start_over()
 
     def _start_over(self) -> None:
-        self.alignment.disengage()
+        self._engagement.reset()
         self._velocity.reset()
-        self._gestures.reset()
-        if self._clutch is not None:
-            self._clutch.reset()
-        self._refusal = ""
+        self._hands.reset()
+        self._wishes: list[Wish] = []
         self._smoother.reset()
         if self._sync is not None:
             self._sync.reset()
         self._mode = self.device.start_mode
         self._device_mode = self._overruled_mode = None
-        self._started = self._was_refused = False
         self._arms.forget()
         self._follower.forget()
         self._last_time: float | None = None
@@ -214,9 +214,23 @@ class Teleoperation:
             return
         self.device.show(dataclasses.replace(self._shown, progress=progress, pictures=pictures))
 
-    def take_wishes(self) -> tuple[EpisodeWish, ...]:
-        """What the operator asks of the recording since the last call."""
-        return self.device.take_wishes()
+    def take_wishes(self) -> tuple[Wish, ...]:
+        """What the operator asks of the recording since the last call, by gestures or buttons."""
+        wishes, self._wishes = self._wishes, []
+        return (*wishes, *self.device.take_wishes())
+
+    def answer(self, cue: Cue, text: str) -> None:
+        """Tell the operator what has become of a wish."""
+        self._board.tell(cue, text)
+
+    @property
+    def alignment(self) -> Alignment:
+        """How the operator is laid on the robot."""
+        return self._engagement.alignment
+
+    @alignment.setter
+    def alignment(self, alignment: Alignment) -> None:
+        self._engagement.alignment = alignment
 
     def step(self, state: RobotState) -> tuple[RobotAction, TickRecord]:
         """Decide what the robot does next.
@@ -237,22 +251,28 @@ class Teleoperation:
         measured, (state, synced) = state, self._synchronise(state)
         poses = self._compute_frames(state)
         frame = self.device.read(state.time)
-        frame = self._follow_engagement(state, frame, poses)
+        frame = self._engagement.follow(state, frame, poses)
         mode = self._mode
-        goal = self._make_goal(state, frame) if frame is not None else None
+        self._read_gestures(frame)
+        if frame is not None:
+            self._follow_mode(frame)
         if self._mode is not mode:
             source = "gesture" if frame is None or frame.mode is None else "device"
             changes = (*changes, AppliedChange(source, Change(mode=self._mode)))
+        tell_changes(self._board, changes)
+        goal = self._make_goal(state, frame) if frame is not None else None
         if goal is None:
             wanted = self._hold(state)
         else:
             wanted = self._drive(state, goal, poses["head"], dt)
         action = self._limit(state, wanted)
+        holding, progress = self._describe_hold(goal is not None)
         self._shown = Display(
             time=state.time,
             engaged=goal is not None,
             mode=self._mode,
-            clutch=0.0 if self._clutch is None else self._clutch.progress,
+            clutch=progress,
+            holding=holding,
             notices=self._board.notices,
             fallen=state.fallen,
         )
@@ -287,126 +307,45 @@ class Teleoperation:
         poses = self._kinematics.compute_poses(state.qpos)
         return {name: poses[site] for name, site in self.morphology.frames.items()}
 
-    def _follow_engagement(
-        self, state: RobotState, frame: OperatorFrame | None, poses: Mapping[str, np.ndarray]
-    ) -> OperatorFrame | None:
-        """Engage or disengage where it is time to; return the frame to use."""
-        is_over = state.fallen or self.device.is_paused(state.time)
-        if self._clutch is not None:
-            self._follow_clutch(self._clutch, state, frame, poses)
-            return frame
-        if self.alignment.is_engaged:
-            if frame is None or is_lost(frame) or is_over:
-                self.disengage()
-            return frame
-        if not state.settled or is_over:
-            return frame
-        if not self._started:
-            self.device.start(state.time)
-            self._started = True
-            frame = self.device.read(state.time)
-        if frame is not None and not is_lost(frame):
-            self._engage_itself(state, frame, poses)
-        return frame
-
-    def _follow_clutch(
-        self,
-        clutch: Clutch,
-        state: RobotState,
-        frame: OperatorFrame | None,
-        poses: Mapping[str, np.ndarray],
-    ) -> None:
-        """Engage and let go as the person in the headset asks."""
-        wish = clutch.update(frame, self.alignment.is_engaged)
-        if self.alignment.is_engaged:
-            if state.fallen:
-                self._let_go("the robot has fallen")
-            elif wish is Wish.LET_GO and (frame is None or is_lost(frame)):
-                self._let_go("the headset no longer sees where the head is, or is silent")
-            elif wish is Wish.LET_GO:
-                self._let_go("you have let go")
-            return
-        if wish is not Wish.ENGAGE or frame is None:
-            return
-        if state.fallen:
-            self._refuse("Not engaged: the robot has fallen. It engages when it stands.")
-        elif not state.settled:
-            self._refuse("Not engaged yet: the robot still moves. Hold the gesture on.")
-        else:
-            try:
-                self.engage(state, frame, poses)
-            except EngageRefused as refusal:
-                self._refuse(f"Not engaged: {refusal}")
-            else:
-                self._refusal = ""
-                self._tell(Cue.ENGAGED, "Engaged: the robot follows you.")
-
-    def _let_go(self, reason: str) -> None:
-        self.disengage()
-        self._tell(
-            Cue.DISENGAGED,
-            f"Disengaged: {reason}. The robot holds; engage again by the gesture.",
-        )
-
-    def _refuse(self, refusal: str) -> None:
-        """Tell why nobody engages, once for each gesture that asks for it."""
-        if refusal != self._refusal:
-            self._tell(Cue.REFUSED, refusal)
-        self._refusal = refusal
-
-    def _tell(self, cue: Cue, text: str) -> None:
-        logger.info(text)
-        self._board.post(cue, text)
-
     @property
     def notice(self) -> str:
         """What the operator was told last; empty if nothing was."""
         notices = self._board.notices
         return notices[-1].text if notices else ""
 
-    def _engage_itself(
-        self, state: RobotState, frame: OperatorFrame, poses: Mapping[str, np.ndarray]
-    ) -> None:
-        """Engage; a refusal is a fault of the set-up at first, and waited out later on."""
-        try:
-            self.engage(state, frame, poses)
-        except EngageRefused as refusal:
-            if not self._was_engaged:
-                raise
-            if not self._was_refused:
-                logger.warning("%s The robot holds.", refusal)
-            self._was_refused = True
-
-    def engage(
-        self, state: RobotState, frame: OperatorFrame, poses: Mapping[str, np.ndarray]
-    ) -> None:
-        """Lay the operator on the robot and begin to drive it.
-
-        Raises:
-            EngageRefused: If the head is not tracked, or is too low to be over the floor.
-        """
-        self.alignment.engage(frame, poses, float(poses["head"][2]))
-        self._was_engaged, self._was_refused = True, False
+    def _begin_engagement(self, state: RobotState, poses: Mapping[str, np.ndarray]) -> None:
         self._arms.forget()
         self._velocity.reset()
         if self._blend is not None:
             self._blend.engage(poses["head"], poses)
         self._follower.reset(state)
 
-    def disengage(self) -> None:
-        """Stop driving; the robot holds."""
-        self.alignment.disengage()
+    def _end_engagement(self) -> None:
         self._follower.forget()
 
-    def _make_goal(self, state: RobotState, frame: OperatorFrame) -> Goal | None:
-        gesture = self._gestures.update(frame)
-        if gesture is Gesture.DOUBLE_PINCH:
+    def _describe_hold(self, engaged: bool) -> tuple[str, float]:
+        """What the gesture that is held will do, in words, and how much of it has passed."""
+        raised = self._hands.raised
+        if raised.wish is not None:
+            return HOLDING[raised.wish], raised.progress
+        progress = self._engagement.progress
+        if progress <= 0:
+            return "", 0.0
+        return f"Hold on to {'let go' if engaged else 'engage'}", progress
+
+    def _read_gestures(self, frame: OperatorFrame | None) -> None:
+        """Do what the operator's hands say, whether the operator drives or not."""
+        asked = self._hands.read(frame)
+        self._wishes += asked.wishes
+        if asked.mode:
             self._mode = Mode(1 - self._mode)
-        elif gesture is Gesture.BOTH_DOUBLE_PINCH:
-            self._toggle_by_gesture()
-        if frame.mode is not None and frame.mode is not self._overruled_mode:
-            self._mode, self._overruled_mode = frame.mode, None
-        self._device_mode = frame.mode
+        if asked.toggle:
+            try:
+                self.toggle(asked.toggle, "gesture")
+            except XopError as refusal:
+                self._board.tell(Cue.REFUSED, f"Not toggled: {refusal}")
+
+    def _make_goal(self, state: RobotState, frame: OperatorFrame) -> Goal | None:
         if not self.alignment.is_engaged:
             return None
         goals = self.alignment.goal_poses(frame)
@@ -415,15 +354,11 @@ class Teleoperation:
         velocities = self._velocity.update(state.time, goals)
         return Goal(goals, velocities, self._mode, grip_from_pinch(frame.pinch))
 
-    def _toggle_by_gesture(self) -> None:
-        """Toggle what both hands toggle, from the next tick on."""
-        name = self.config.gestures.both_double_pinch
-        if name == "none":
-            return
-        try:
-            self.toggle(name, "gesture")
-        except XopError as refusal:
-            logger.warning("The gesture of both hands changes nothing: %s", refusal)
+    def _follow_mode(self, frame: OperatorFrame) -> None:
+        """Take the mode that the device itself states, if it states one."""
+        if frame.mode is not None and frame.mode is not self._overruled_mode:
+            self._mode, self._overruled_mode = frame.mode, None
+        self._device_mode = frame.mode
 
     def _hold(self, state: RobotState) -> RobotAction:
         """Stand where and as the robot stands: velocities stop, the posture stays."""

@@ -201,9 +201,9 @@ class Xop(Teleoperator):
             self._teleoperation.reset(self._session.obstacles, self._session.episode)
         self._teleoperation.see(self._session.view)
         action, self._session.tick = self._teleoperation.step(state)
-        self._teleoperation.show(self._session.progress, self._session.pictures)
         for wish in self._teleoperation.take_wishes():
-            self._session.ask(wish)
+            self._teleoperation.answer(*self._session.ask(wish))
+        self._teleoperation.show(self._session.progress, self._session.pictures)
         return info.morphology.layout.to_dict(action)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:

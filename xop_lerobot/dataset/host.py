@@ -128,6 +128,9 @@ class Host:
                 if dataset is None and lockstep and not self._has_person:
                     # The robot resets itself, and nobody has to tidy a simulation.
                     return
+                recorder = get_session(self._session).recorder
+                if dataset is None and recorder is not None:
+                    recorder.pause(call["events"])
                 if dataset is not None and lockstep:
                     dataset.begin(call["events"], count_ticks(call["control_time_s"], call["fps"]))
                     call["control_time_s"] = math.inf

@@ -17,6 +17,7 @@ class Tally:
         last: The same at the last frame [s].
         success: Whether the task is accomplished.
         marked: The same as the operator has marked it, None where nobody has.
+        driven: Whether somebody has driven the robot.
         fallen: Whether the robot fell.
         collision: Whether it touched anything but the ground.
         finished: Whether the operator's recording has played out.
@@ -31,6 +32,7 @@ class Tally:
         self.last = self.first = 0.0
         self.success = self.fallen = self.collision = self.finished = False
         self.marked: bool | None = None
+        self.driven = False
         self.task = ""
         self.settings: dict[str, Any] = {}
         self.changes: list[dict[str, Any]] = []
@@ -41,6 +43,13 @@ class Tally:
             self.settings = dict(tick.settings)
         for change in tick.changes:
             self.changes.append({"frame": self.frames, "time": tick.state.time, **change.to_dict()})
+
+    def mark(self, success: bool, time: float) -> None:
+        """Take down what the operator says of the episode, at `time` [s] of the robot's clock."""
+        self.marked = self.success = success
+        frame = max(self.frames - 1, 0)
+        change = {"frame": frame, "time": time, "source": "operator"}
+        self.changes.append({**change, "change": {"success": success}})
 
     @property
     def fps(self) -> float:

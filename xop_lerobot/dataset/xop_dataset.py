@@ -7,6 +7,7 @@ and teleoperator meet (`xop_lerobot.link`), so the loops need not know of it.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import shutil
@@ -16,6 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Self, cast
 
+import numpy as np
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
@@ -34,9 +36,10 @@ from xop_lerobot.dataset.facts import (
 from xop_lerobot.dataset.shutdown import hold_signals
 from xop_lerobot.dataset.tally import Tally
 from xop_lerobot.dataset.video_queue import VideoQueue
+from xop_lerobot.dataset.wishes import grant
 from xop_lerobot.errors import XopError
 from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
-from xop_lerobot.operator.display import Progress, Wish
+from xop_lerobot.operator.display import Cue, Progress, Wish
 
 logger = logging.getLogger(__name__)
 
@@ -155,7 +158,7 @@ class XopDataset(LeRobotDataset):
         self._keep_facts, self._own_root = True, False
         self._tally = Tally()
         self._tick_limit: int | None = None
-        self._stop_on_success = False
+        self._stop_on_success = self._paused = False
         self._events: MutableMapping[str, bool] = {}
         self._config_hash = compute_config_hash(self._session.configs)
         write_config(self.root, self._session.configs)
@@ -212,7 +215,25 @@ class XopDataset(LeRobotDataset):
             stop_on_success: Whether it is over as soon as the task is accomplished.
         """
         self._events, self._tick_limit = events, tick_limit
-        self._stop_on_success = stop_on_success
+        self._stop_on_success, self._paused = stop_on_success, False
+        self._session.recorder = self
+
+    def pause(self, events: MutableMapping[str, bool]) -> None:
+        """Say that the pause after an episode begins, in which that can still be discarded."""
+        self._events, self._paused = events, True
+        progress = self._session.progress
+        if progress is not None:
+            self._session.progress = dataclasses.replace(progress, paused=True)
+
+    def grant(self, wish: Wish) -> tuple[Cue, str]:
+        """Do with the episode what the operator asks for; return what to tell the operator."""
+        state = self._session.state
+        time = 0.0 if state is None else state.time
+        told = grant(wish, self._events, self._tally, paused=self._paused, time=time)
+        progress = self._session.progress
+        if progress is not None:
+            self._session.progress = dataclasses.replace(progress, success=self._tally.success)
+        return told
 
     def add_frame(self, frame: dict) -> None:
         """Add a frame with this tick's extra columns."""
@@ -227,6 +248,7 @@ class XopDataset(LeRobotDataset):
         super().add_frame(frame)
         if tick is not None:
             tally.note_changes(tick)
+            tally.driven |= tick.engaged
 
         tally.last = time.perf_counter()
         if tally.frames == 0:
@@ -238,26 +260,12 @@ class XopDataset(LeRobotDataset):
         tally.success = outcome is not None and outcome.success
         if tally.marked is not None:
             tally.success = tally.marked
-        self._grant_wishes()
         tally.finished = tick is not None and tick.finished
         is_over = tally.finished or tally.frames == self._tick_limit
         if is_over or (self._stop_on_success and tally.success):
             self._events["exit_early"] = True
         length = tally.frames / self.fps
         session.progress = Progress(self.num_episodes, tally.frames, length, tally.success)
-
-    def _grant_wishes(self) -> None:
-        """Do with the episode what the operator has asked for, as keys do."""
-        for wish in self._session.take_wishes():
-            if wish is Wish.SUCCESS:
-                self._tally.marked = not self._tally.success
-                self._tally.success = self._tally.marked
-                continue
-            self._events["exit_early"] = True
-            if wish is Wish.REDO:
-                self._events["rerecord_episode"] = True
-            elif wish is Wish.STOP:
-                self._events["stop_recording"] = True
 
     def _current_tick(self) -> TickRecord | None:
         """The teleoperator's record of this very tick, None if a policy drove the robot."""
@@ -277,6 +285,7 @@ class XopDataset(LeRobotDataset):
                 f"episode {index} lost {facts.dropped_frames} video frames; it is not saved"
             )
         length = self._tally.frames
+        self._write_mark(episode_data)
         with hold_signals(), skip_embedding(self):
             super().save_episode(episode_data, parallel_encoding)
             self._own_root = False
@@ -292,6 +301,16 @@ class XopDataset(LeRobotDataset):
             )
         self._begin_next(index + 1)
 
+    def _write_mark(self, episode_data: dict | None) -> None:
+        """Bring `next.success` in line with the operator's mark, as `xop-curate label` does."""
+        marked = self._tally.marked
+        buffer = episode_data or (self.writer.episode_buffer if self.writer else {})
+        rows = buffer.get("next.success")
+        if marked is None or not rows:
+            return
+        rows[:] = [row if marked else np.zeros_like(row) for row in rows]
+        rows[-1] = np.full_like(rows[-1], marked)
+
     def clear_episode_buffer(self, delete_images: bool = True) -> None:
         """Discard the episode and ask the robot to start over."""
         super().clear_episode_buffer(delete_images)
@@ -303,6 +322,8 @@ class XopDataset(LeRobotDataset):
             return
         super().finalize()
         self._session.progress = None
+        if self._session.recorder is self:
+            self._session.recorder = None
         durability.forget_rotation(self)
         if self._own_root and self.num_episodes == 0:
             shutil.rmtree(self.root, ignore_errors=True)
@@ -360,6 +381,7 @@ _KEPT = (
     "_tally",
     "_tick_limit",
     "_stop_on_success",
+    "_paused",
     "_events",
     "_config_hash",
     "more_facts",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,8 @@ from enum import Enum
 import numpy as np
 
 from xop_lerobot.command import Mode
+
+logger = logging.getLogger(__name__)
 
 
 class Cue(Enum):
@@ -66,6 +69,11 @@ class NoticeBoard:
         self._count += 1
         self._notices.append(Notice(self._count, cue, text))
 
+    def tell(self, cue: Cue, text: str) -> None:
+        """Add a notice, and log it for who sits at the terminal."""
+        logger.info(text)
+        self.post(cue, text)
+
     @property
     def notices(self) -> tuple[Notice, ...]:
         """The last ones, the newest at the end."""
@@ -81,12 +89,14 @@ class Progress:
         frames: Its frames so far.
         seconds: Its length so far [s].
         success: Whether it counts as a success so far.
+        paused: Whether this is the pause after the episode, which is not saved yet.
     """
 
     episode: int
     frames: int
     seconds: float
     success: bool
+    paused: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,7 +107,8 @@ class Display:
         time: Clock of the robot [s].
         engaged: Whether the operator drives.
         mode: Mode of the robot.
-        clutch: How much of the clutch's hold has passed, from 0 to 1.
+        clutch: How much of the hold of the gesture that is held has passed, from 0 to 1.
+        holding: What that gesture will do, in words; empty where none is held.
         notices: What has happened lately, the newest at the end.
         warnings: What is wrong now, in words.
         fallen: Whether the robot has fallen.
@@ -109,6 +120,7 @@ class Display:
     engaged: bool = False
     mode: Mode = Mode.STATIONARY
     clutch: float = 0.0
+    holding: str = ""
     notices: tuple[Notice, ...] = ()
     warnings: tuple[str, ...] = ()
     fallen: bool = False

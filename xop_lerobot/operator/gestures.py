@@ -1,4 +1,4 @@
-"""Pinches: double pinches of one hand or of both, and how far a hand is closed."""
+"""What the operator's hands say: double pinches of one hand or of both, and raised hands."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.operator.clutch import ClutchConfig
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.raised_hands import RaisedHandsConfig
 from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS
 
 HANDS = ("left", "right")
@@ -188,7 +189,12 @@ class Gesture(Enum):
     """What the operator's hands say."""
 
     DOUBLE_PINCH = "double_pinch"
+    OTHER_DOUBLE_PINCH = "other_double_pinch"
     BOTH_DOUBLE_PINCH = "both_double_pinch"
+
+
+OTHER_PINCHES = ("success", "none")
+"""What a double pinch of the hand that does not toggle the mode can do."""
 
 
 @dataclass
@@ -197,19 +203,24 @@ class GestureConfig:
 
     Attributes:
         double_pinch: When two pinches of one hand count; they toggle the mode.
+        other_double_pinch: What a double pinch of the other hand does: ``"success"`` marks the
+            episode as a success, or takes the mark off again; or ``"none"``.
         both_double_pinch: What a double pinch of both hands at once toggles: a constraint
             (`upright`), a preset against `default`, or `none`.
         window: Longest time between the double pinches of the two hands [s].
+        raised: What raised hands ask of the recording.
         clutch: How somebody in a headset engages the robot, and lets it go.
     """
 
     double_pinch: DoublePinchConfig = field(default_factory=DoublePinchConfig)
+    other_double_pinch: str = "success"
     both_double_pinch: str = "upright"
     window: float = 0.5
+    raised: RaisedHandsConfig = field(default_factory=RaisedHandsConfig)
     clutch: ClutchConfig = field(default_factory=ClutchConfig)
 
     def __post_init__(self) -> None:
-        """Check both values.
+        """Check the values of its own.
 
         Raises:
             UnknownName: If there is nothing of that name to toggle.
@@ -218,16 +229,17 @@ class GestureConfig:
         known = ("none", *CONSTRAINTS, *PRESETS)
         if self.both_double_pinch not in known:
             raise UnknownName("gestures.both_double_pinch", self.both_double_pinch, known)
+        if self.other_double_pinch not in OTHER_PINCHES:
+            raise UnknownName("gestures.other_double_pinch", self.other_double_pinch, OTHER_PINCHES)
         if not (math.isfinite(self.window) and self.window > 0):
             raise BadValue(f"gestures.window must be finite and above 0, got {self.window}")
 
 
 class GestureReader:
-    """Tells a double pinch of one hand from one of both hands.
+    """Tells double pinches of either hand from those of both hands.
 
-    The double pinch of the hand that toggles counts at once, unless the other hand is just
-    pinching too or has just done so: then it counts when that is decided, as one of both hands
-    or of its own.
+    The double pinch of one hand counts at once, unless the other hand is just pinching too or
+    has just done so: then it counts when that is decided, as one of both hands or of its own.
 
     Args:
         config: The hand that toggles, its thresholds and durations, and the window.
@@ -237,31 +249,33 @@ class GestureReader:
         config = config or GestureConfig()
         first = config.double_pinch
         other = HANDS[1 - HANDS.index(first.hand)]
-        self._first = DoublePinchDetector(first)
-        self._other = DoublePinchDetector(dataclasses.replace(first, hand=other))
+        self._detectors = {
+            Gesture.DOUBLE_PINCH: DoublePinchDetector(first),
+            Gesture.OTHER_DOUBLE_PINCH: DoublePinchDetector(dataclasses.replace(first, hand=other)),
+        }
         self._window = config.window
         self.reset()
 
     def reset(self) -> None:
         """Forget everything seen so far."""
-        self._first.reset()
-        self._other.reset()
-        self._first_at: float | None = None  # a double pinch that is not decided yet
-        self._other_at = -math.inf
+        for detector in self._detectors.values():
+            detector.reset()
+        self._pending: dict[Gesture, float] = {}  # since when one is not decided yet
 
     def update(self, frame: OperatorFrame) -> Gesture | None:
         """Take one sample; return the gesture that is complete with it, None for none."""
-        if self._other.update(frame):
-            self._other_at = frame.time
-        if self._first.update(frame):
-            self._first_at = frame.time
-        if self._first_at is None:
-            return None
-        if abs(self._first_at - self._other_at) <= self._window:
-            self._first_at, self._other_at = None, -math.inf
-            return Gesture.BOTH_DOUBLE_PINCH
-        waited = frame.time - self._first_at
-        if self._other.is_busy and 0 <= waited < self._window:
-            return None
-        self._first_at = None
-        return Gesture.DOUBLE_PINCH
+        for gesture, detector in self._detectors.items():
+            if detector.update(frame):
+                self._pending[gesture] = frame.time
+        if len(self._pending) > 1:
+            first, second = sorted(self._pending.values())
+            if second - first <= self._window:
+                self._pending.clear()
+                return Gesture.BOTH_DOUBLE_PINCH
+        for gesture, since in sorted(self._pending.items(), key=lambda item: item[1]):
+            others = [each for name, each in self._detectors.items() if name is not gesture]
+            waits = 0 <= frame.time - since < self._window
+            if not (waits and any(each.is_busy for each in others)):
+                del self._pending[gesture]
+                return gesture
+        return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,16 +65,21 @@ def load_motion(path: Path) -> Motion:
 
 def simulate_motion(seed: int, duration: float = 30.0) -> Motion:
     """A simulated person who stands, walks, turns and reaches by chance, alone in the room."""
+    frames = list(simulate_frames(seed, duration))
+    return _make_motion(f"simulated {seed}", frames, simulated=True)
+
+
+def simulate_frames(seed: int, duration: float, rate: float = RATE) -> Iterator[OperatorFrame]:
+    """Frames of the same person, `rate` of them in a second [Hz]."""
     mind = Mind(seed)
     body, rng = mind.body, np.random.default_rng((seed, 9))
-    frames, resting = [], 0.0
-    for time in np.arange(0, duration, 1 / RATE):
+    resting = 0.0
+    for time in np.arange(0, duration, 1 / rate):
         body.advance(float(time))
         if not body.is_moving and time >= resting:
             _move_by_chance(mind, body, rng)
             resting = time + float(rng.uniform(0.3, 3.0))
-        frames.append(body.make_frame(float(time)))
-    return _make_motion(f"simulated {seed}", frames, simulated=True)
+        yield body.make_frame(float(time))
 
 
 def _move_by_chance(mind: Mind, body: Body, rng: np.random.Generator) -> None:

@@ -1,0 +1,203 @@
+"""A raised hand that pinches and holds still asks something of the recording."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.operator.display import Wish
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.transforms import quat_from_yaw, quat_rotate
+
+RAISED = ("left", "right", "both", "none")
+WRISTS = ("left_wrist", "right_wrist")
+UPRIGHT, STILL_UPRIGHT = 0.7, 0.5
+"""Fingers point so far up, and the palm so far forward, as a sine: 45°, and 30° to go on."""
+BELOW_EYES = 0.5
+"""A raised wrist is no farther below the eyes [m]."""
+WISHES = {"end": Wish.END, "redo": Wish.REDO, "stop": Wish.STOP}
+HOLDING = {
+    Wish.END: "Hold on to end the episode",
+    Wish.REDO: "Hold on to discard the episode",
+    Wish.STOP: "Hold on to stop the session",
+}
+"""What somebody who holds a gesture is told."""
+
+
+@dataclass
+class RaisedHandsConfig:
+    """Which hand is raised for what, ``"left"``, ``"right"``, ``"both"`` or ``"none"``.
+
+    Attributes:
+        end: Raised to end the episode: it is saved.
+        redo: Raised to discard the episode and record it again.
+        stop: Raised to end the session.
+        hold: How long `end` is held [s].
+        long_hold: How long `redo` and `stop` are held, which cannot be undone [s].
+        on: A hand closes at this distance of thumb and index tip [m].
+        off: It opens again at this distance [m].
+        slack: A hand that is held stays within this distance of where it closed [m].
+        max_gap: Longest time between two frames over which a gesture goes on [s].
+    """
+
+    end: str = "right"
+    redo: str = "left"
+    stop: str = "both"
+    hold: float = 1.0
+    long_hold: float = 2.0
+    on: float = 0.018
+    off: float = 0.035
+    slack: float = 0.06
+    max_gap: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            UnknownName: If there are no such hands, with the known ones.
+            BadValue: If a number is not above 0, `on` is not below `off`, or the same hands
+                are raised for two things.
+        """
+        hands = {name: getattr(self, name) for name in WISHES}
+        for name, which in hands.items():
+            if which not in RAISED:
+                raise UnknownName(f"gestures.raised.{name}", which, RAISED)
+        used = [which for which in hands.values() if which != "none"]
+        for which in set(used):
+            if used.count(which) > 1:
+                names = " and ".join(name for name in hands if hands[name] == which)
+                raise BadValue(f"gestures.raised: {names} must not have the same hand ({which})")
+        for name in ("hold", "long_hold", "on", "off", "slack", "max_gap"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise BadValue(f"gestures.raised.{name} must be finite and above 0, got {value}")
+        if self.on >= self.off:
+            raise BadValue(f"gestures.raised.on must be below off, got {self.on} and {self.off}")
+
+
+class _Hand:
+    """One hand: whether it is raised, and whether it has closed since.
+
+    Only a pinch that began in a raised hand counts, so a hand that carries something makes no
+    gesture, however it is turned.
+    """
+
+    def __init__(self, name: str, config: RaisedHandsConfig) -> None:
+        self._name, self._config = name, config
+        self.reset()
+
+    def reset(self) -> None:
+        self.raised = self._ready = False
+        self._place: np.ndarray | None = None
+
+    @property
+    def closed(self) -> bool:
+        """Whether it has closed while it was raised, and was held still since."""
+        return self._place is not None
+
+    def follow(self, frame: OperatorFrame, forward: np.ndarray, pinch: float) -> None:
+        wrist = frame.pose(self._name)
+        limit = STILL_UPRIGHT if self.raised else UPRIGHT
+        fingers = quat_rotate(wrist[3:], np.array([1.0, 0, 0]))
+        palm = quat_rotate(wrist[3:], np.array([0.0, 0, -1]))
+        high = wrist[2] >= frame.head[2] - BELOW_EYES
+        self.raised = bool(high and fingers[2] >= limit and palm @ forward >= limit)
+        if not self.raised:
+            self.reset()
+        elif pinch >= self._config.off:
+            self._ready, self._place = True, None
+        elif self._place is not None:
+            if np.linalg.norm(wrist[:3] - self._place) > self._config.slack:
+                self._ready, self._place = False, None
+        elif self._ready and pinch <= self._config.on:
+            self._place = wrist[:3].copy()
+
+    def spend(self) -> None:
+        """The gesture has had its effect; the next one begins with an open hand."""
+        self._ready, self._place = False, None
+
+
+class RaisedHands:
+    """Tells from the frames alone what the operator asks of the recording.
+
+    A hand is raised as if to say "halt": fingers up, palm away from the person. It closes
+    thumb and index there, and is held still. What is asked for depends on which hands are
+    raised. Head and both hands must be seen. Only stamps count, so that a recorded stream
+    replays to the same gestures.
+
+    Args:
+        config: Which hand is raised for what, and for how long.
+    """
+
+    def __init__(self, config: RaisedHandsConfig | None = None) -> None:
+        self.config = config or RaisedHandsConfig()
+        c = self.config
+        self._wishes = {getattr(c, name): wish for name, wish in WISHES.items()}
+        self._wishes.pop("none", None)
+        self._hands = [_Hand(name, c) for name in WRISTS]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything seen so far."""
+        self._time: float | None = None
+        self._stop()
+
+    def _stop(self) -> None:
+        for hand in self._hands:
+            hand.reset()
+        self.wish: Wish | None = None
+        """What the gesture that is held asks for, None if none is held."""
+        self._since = 0.0
+        self.progress = 0.0
+        """How much of its hold has passed, from 0 to 1."""
+
+    def update(self, frame: OperatorFrame | None) -> Wish | None:
+        """Take one sample; return what is asked for with it, once for each gesture.
+
+        Frames with the stamp of the last one change nothing; a stamp that goes back starts anew.
+
+        Args:
+            frame: The operator now, None before the first.
+        """
+        if frame is None or not frame.tracked.all():
+            self.reset()
+            return None
+        if self._time is not None:
+            if frame.time == self._time:
+                return None
+            if not 0 < frame.time - self._time <= self.config.max_gap:
+                self._stop()
+        self._time = frame.time
+        forward = quat_rotate(quat_from_yaw(compute_heading(frame.head[3:])), np.eye(3)[0])
+        for hand, pinch in zip(self._hands, frame.pinch, strict=True):
+            hand.follow(frame, forward, float(pinch))
+        return self._hold(frame.time)
+
+    def _hold(self, time: float) -> Wish | None:
+        wish = self._find_wish()
+        if wish is not self.wish:
+            self.wish, self._since = wish, time
+        if wish is None:
+            self.progress = 0.0
+            return None
+        length = self.config.hold if wish is Wish.END else self.config.long_hold
+        # Stamps add up rounding; a microsecond must not cost a sample.
+        self.progress = min((time - self._since + 1e-6) / length, 1.0)
+        if self.progress < 1:
+            return None
+        for hand in self._hands:
+            hand.spend()
+        self.wish, self.progress = None, 0.0
+        return wish
+
+    def _find_wish(self) -> Wish | None:
+        """What the hands ask for now: all that are raised must be closed."""
+        raised = [hand.raised for hand in self._hands]
+        if not any(raised) or [hand.closed for hand in self._hands] != raised:
+            return None
+        which = "both" if all(raised) else "left" if raised[0] else "right"
+        return self._wishes.get(which)
