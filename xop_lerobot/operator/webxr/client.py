@@ -20,6 +20,8 @@ SEND_S = 0.05
 """Period of what is shown [s]."""
 PING_S = 0.5
 """Period of pings [s]."""
+MAX_ON_THE_WAY = 2
+"""Pictures that may be on their way; each is followed by a ping, whose answer says it is there."""
 UNSENT = 16 * 1024
 """What the system may hold back for a slow client before it counts as slow [bytes]."""
 
@@ -49,6 +51,7 @@ class Client:
         self._transport = request.transport
         self._shown: list[str] = []
         self._picture: Picture | None = None
+        self._on_the_way: list[int] = []  # the pings behind them
         _limit_buffer(self._transport)
 
     def abort(self) -> None:
@@ -59,6 +62,7 @@ class Client:
     def take_pong(self, pong: Pong) -> None:
         """Take the answer to a ping; others are ignored."""
         self._offset.pong(pong.number, pong.sent, self._clock())
+        self._on_the_way = [number for number in self._on_the_way if number > pong.number]
 
     def measure_delay(self, message: FrameMessage, time: float) -> tuple[float, float] | None:
         """How long ago a frame that comes at `time` [s] was sent.
@@ -83,8 +87,7 @@ class Client:
             try:
                 if loop.time() >= next_ping:
                     next_ping = loop.time() + PING_S
-                    time = self._clock()
-                    await self.ws.send_str(write_ping(self._offset.ping(time), time))
+                    await self._ping()
                 await self._send_new(write_shown(self.role), take_picture())
             except ConnectionError:
                 return
@@ -93,6 +96,12 @@ class Client:
                 self.abort()
                 return
             await asyncio.sleep(SEND_S)
+
+    async def _ping(self) -> int:
+        time = self._clock()
+        number = self._offset.ping(time)
+        await self.ws.send_str(write_ping(number, time))
+        return number
 
     async def _send_new(self, shown: list[str], picture: Picture | None) -> None:
         for text in shown:
@@ -105,10 +114,13 @@ class Client:
         self._picture = picture
         for data in picture.messages:
             await self.ws.send_bytes(data)
+        self._on_the_way.append(await self._ping())
 
     def _is_idle(self) -> bool:
         transport = self._transport
-        return transport is not None and transport.get_write_buffer_size() == 0
+        if transport is None or len(self._on_the_way) >= MAX_ON_THE_WAY:
+            return False
+        return transport.get_write_buffer_size() == 0
 
 
 def _limit_buffer(transport: asyncio.Transport | None) -> None:
