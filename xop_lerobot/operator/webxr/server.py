@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
@@ -15,6 +14,7 @@ from aiohttp import WSMsgType, web
 from xop_lerobot.operator.display import Wish
 from xop_lerobot.operator.webxr.certificate import Certificate
 from xop_lerobot.operator.webxr.client import Client
+from xop_lerobot.operator.webxr.connections import Connections, Handler
 from xop_lerobot.operator.webxr.pairing import Door
 from xop_lerobot.operator.webxr.pictures import Picture
 from xop_lerobot.operator.webxr.protocol import (
@@ -37,6 +37,10 @@ HEARTBEAT_S = 3.0
 """Clients that answer nothing for so long are let go [s]."""
 CLOSE_S = 2.0
 """How long a farewell may take [s]."""
+HANDSHAKE_S = 5.0
+"""How long TLS may take [s]."""
+ARRIVAL_S = 0.5
+"""How long a connection without TLS may take to be there [s]."""
 DRIVES = "somebody drives already; wait until they have left, or open the page as a monitor"
 HEADERS = {
     "Cache-Control": "no-store",
@@ -113,10 +117,14 @@ class HeadsetServer:
         self._operator: Client | None = None
         self._clients: set[Client] = set()
         self._farewells: set[asyncio.Task[None]] = set()
+        self._connections = Connections(HANDSHAKE_S if certificate else ARRIVAL_S)
+        self._port: asyncio.Server | None = None
 
     async def run(self, listener: socket.socket, stop: asyncio.Event) -> None:
         """Serve at `listener`, which is closed in the end, until `stop` is set."""
-        app = web.Application(client_max_size=0, middlewares=[_add_headers])
+        app = web.Application(
+            client_max_size=1, middlewares=[self._connections.note_request, _add_headers]
+        )
         app.router.add_get("/", self._send_page)
         app.router.add_get("/cert", self._send_certificate)
         app.router.add_get("/ws", self._serve_socket)
@@ -131,9 +139,16 @@ class HeadsetServer:
         await runner.setup()
         try:
             tls = None if self._certificate is None else self._certificate.make_context()
-            await web.SockSite(runner, listener, ssl_context=tls).start()
+            self._port = await asyncio.get_running_loop().create_server(
+                lambda: self._connections.let_in(runner.server),
+                sock=listener,
+                ssl=tls,
+                ssl_handshake_timeout=HANDSHAKE_S if tls else None,
+            )
             await stop.wait()
         finally:
+            if self._port is not None:
+                self._port.close()
             for client in list(self._clients):
                 await self._dismiss(client, "the session has ended")
             await runner.cleanup()
@@ -275,9 +290,7 @@ def _is_own_page(request: web.Request) -> bool:
 
 
 @web.middleware
-async def _add_headers(
-    request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
-) -> web.StreamResponse:
+async def _add_headers(request: web.Request, handler: Handler) -> web.StreamResponse:
     try:
         response = await handler(request)
     except web.HTTPException as error:
