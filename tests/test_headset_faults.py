@@ -11,122 +11,28 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from avp_server import AvpServer, encode, wait_for
+from avp_server import AvpServer
+from headset_rig import POLICIES, RATE, Fault, Rig
 
-from xop_lerobot.command import RobotAction
-from xop_lerobot.link import RobotInfo, TickRecord
-from xop_lerobot.low_level.policy import make_policy
-from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.clutch import Clutch, Wish
-from xop_lerobot.operator.devices import DEVICES, DeviceConfig
-from xop_lerobot.operator.devices.avp import AvpDevice
+from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.plant.config import SimulationConfig
-from xop_lerobot.plant.policy_loop import PolicyLoop
-from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
-from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
-
-POLICIES = {"g1": "default", "rby1": "diff_drive"}
-FPS, RATE = 25, 50
-UP = quat_exp(np.array([np.pi, 0, 0]))
-Fault = Callable[[float, OperatorFrame], list[OperatorFrame | bytes]]
-
-
-def make_person(t: float, gesture: bool) -> OperatorFrame:
-    """Somebody who sways a little, squats a little, and moves the hands."""
-    sway = 0.004 * np.array([np.sin(3 * t), np.cos(2 * t), np.sin(5 * t)])
-    quat = quat_exp(sway)
-    reach = 0.0 if gesture else 0.05 * np.sin(1.5 * t)
-    hand = quat_multiply(quat, UP) if gesture else quat
-    wrists = [make_pose(sway + [0.3 + reach, y, 1.15], hand) for y in (0.2, -0.2)]
-    head = make_pose(sway + [0, 0, 1.6], quat)
-    return OperatorFrame(t, head, *wrists, pinch=np.full(2, 0.008 if gesture else 0.07))
-
-
-def pass_on(t: float, frame: OperatorFrame) -> list[OperatorFrame | bytes]:
-    del t
-    return [frame]
-
-
-class Rig:
-    """Headset, connection, teleoperation and robot; `run` lets time pass, message by message."""
-
-    def __init__(self, name: str, server: AvpServer) -> None:
-        self.server, self.now, self.sent = server, 0.0, 0
-        morphology = make_morphology(name)
-        self.morphology = morphology
-        plant = Simulation(morphology, SimulationConfig(), kind="planning")
-        self.loop = PolicyLoop(morphology, plant, make_policy(POLICIES[name]))
-        info = RobotInfo(f"xop_{name}", morphology, POLICIES[name], None, "empty", FPS, 0)
-        config = TeleoperationConfig(
-            device=DeviceConfig(type="headset", host="127.0.0.1", port=server.port),
-            retargeter=RetargeterConfig(type="direct"),
-        )
-        self.teleop = Teleoperation(config, info)
-        device = self.teleop.device
-        assert isinstance(device, AvpDevice)
-        self.device = device
-        device.clock = lambda: self.now
-        self.teleop.connect()
-        server.wait_for_clients()
-        self.loop.reset(seed=0, settle_s=0.8)
-        self.ticks: list[tuple[RobotAction, TickRecord]] = []
-        self.notices: list[str] = []
-
-    def run(self, seconds: float, fault: Fault = pass_on, gesture: bool = False) -> None:
-        start = self.now
-        for i in range(round(seconds * FPS)):
-            for k in range(RATE // FPS):
-                self.now = start + i / FPS + (k + 1) / RATE
-                for message in fault(self.now - start, make_person(self.now, gesture)):
-                    self.server.send(
-                        encode(message) if isinstance(message, OperatorFrame) else message
-                    )
-                    self.sent += 1
-                wait_for(lambda: self.device.handled >= self.sent)
-            action, record = self.teleop.step(self.loop.state)
-            self.loop.execute(action, 1 / FPS)
-            self.ticks.append((action, record))
-            self.notices.append(self.teleop.notice)
-
-    def engage(self) -> None:
-        self.run(0.8)  # after a jump, until head and then open hands are believed
-        self.run(1.6, gesture=True)  # to turn the hands over counts as a jump
-        assert self.is_engaged, self.teleop.notice
-        self.run(0.4)
-
-    @property
-    def is_engaged(self) -> bool:
-        return self.ticks[-1][1].engaged
-
-    def check(self) -> None:
-        """No command above its rate limit, no arm faster than arms are, no fall."""
-        assert not self.loop.state.fallen
-        commands = np.array([action.command for action, _ in self.ticks])
-        limit = self.morphology.command_space.max_rate / FPS + 1e-6
-        assert (np.abs(np.diff(commands, axis=0)) <= limit).all()
-        num_joints = self.teleop._arms.ik.num_joints
-        arms = np.array([action.arms for action, _ in self.ticks])[:, :num_joints]
-        assert np.abs(np.diff(arms, axis=0)).max() <= 3.0 / FPS + 1e-6
 
 
 @pytest.fixture
 def make_rig() -> Iterator[Callable[[str], Rig]]:
-    DEVICES.add("headset", AvpDevice)
     server, made = AvpServer(), []
 
     def make(name: str) -> Rig:
-        made.append(Rig(name, server))
+        config = DeviceConfig(type="avp", host="127.0.0.1", port=server.port)
+        made.append(Rig(name, config, server.send))
+        server.wait_for_clients()
         return made[-1]
 
     yield make
     for rig in made:
-        rig.teleop.disconnect()
-        rig.loop.close()
+        rig.close()
     server.close()
-    DEVICES.remove("headset")
 
 
 def lose_left(start: float, end: float) -> Fault:

@@ -23,6 +23,11 @@ class Device(ABC):
     self_engaging: bool = False
     start_mode: Mode = Mode.STATIONARY
 
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the device now, in words; empty if nothing is."""
+        return ""
+
     def connect(self) -> None:
         """Open the device; a file is read and checked here, before any robot moves."""
 

@@ -16,6 +16,9 @@ from xop_lerobot.state import RobotState
 
 logger = logging.getLogger(__name__)
 
+UNSEEN = "the headset no longer sees where the head is, or is silent"
+"""Why the operator has let go, where the device knows no better."""
+
 
 class Engagement:
     """Engages the operator, and lets go of the robot again.
@@ -30,6 +33,7 @@ class Engagement:
         alignment: Lays the operator on the robot.
         clutch: Reads the gesture; None for devices that engage by themselves.
         board: Where the operator is told what happens.
+        robot_reach: Forward reach of the robot's arms [m], None where it does not matter.
         begin: Called with the state and the robot's frames when an engagement begins.
         end: Called when one ends.
     """
@@ -41,11 +45,13 @@ class Engagement:
         clutch: Clutch | None,
         board: NoticeBoard,
         *,
+        robot_reach: float | None = None,
         begin: Callable[[RobotState, Mapping[str, np.ndarray]], None],
         end: Callable[[], None],
     ) -> None:
         self.alignment, self.clutch = alignment, clutch
         self._device, self._board = device, board
+        self._robot_reach = robot_reach
         self._begin, self._end = begin, end
         self._was_engaged = False
         self.reset()
@@ -128,7 +134,7 @@ class Engagement:
             if state.fallen:
                 self._let_go("the robot has fallen")
             elif wish is Wish.LET_GO and (frame is None or is_lost(frame)):
-                self._let_go("the headset no longer sees where the head is, or is silent")
+                self._let_go(self._device.trouble or UNSEEN)
             elif wish is Wish.LET_GO:
                 self._let_go("you have let go")
             return
@@ -168,7 +174,7 @@ class Engagement:
         Raises:
             EngageRefused: If the head is not tracked, or is too low to be over the floor.
         """
-        self.alignment.engage(frame, poses, float(poses["head"][2]))
+        self.alignment.engage(frame, poses, float(poses["head"][2]), self._robot_reach)
         self._was_engaged, self._was_refused = True, False
         self._begin(state, poses)
 

@@ -229,6 +229,11 @@ class LiveDevice(Device):
         self._say(reason)
 
     @property
+    def trouble(self) -> str:
+        """What is wrong with the stream now, in words; empty if nothing is."""
+        return self.status.trouble
+
+    @property
     def status(self) -> StreamStatus:
         """How the stream is doing now."""
         with self._lock:
