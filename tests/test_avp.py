@@ -40,7 +40,8 @@ def server() -> Iterator[AvpServer]:
 
 @pytest.fixture
 def device(server) -> Iterator[Any]:
-    made = make_device(DeviceConfig(type="avp", host="127.0.0.1", port=server.port))
+    config = DeviceConfig(type="avp", host="127.0.0.1", port=server.port, smoothing=0)
+    made = make_device(config)
     assert isinstance(made, AvpDevice)
     made.connect()
     server.wait_for_clients()

@@ -252,7 +252,7 @@ def test_delay_meter():
 
 @pytest.fixture
 def device() -> Iterator[WebXrDevice]:
-    made = make_device(DeviceConfig(type="webxr", port=find_port(), code=CODE))
+    made = make_device(DeviceConfig(type="webxr", port=find_port(), code=CODE, smoothing=0))
     assert isinstance(made, WebXrDevice)
     made.connect()
     yield made
@@ -407,7 +407,7 @@ def test_a_page_that_is_loaded_anew(device, page):
     device.read(0.0)
     page.close()
     wait_for(lambda: not device.status.connected)
-    assert device.status.trouble == "the connection was closed"
+    assert device.status.trouble == "the page has closed the connection"
     assert not device.read(0.0).tracked.any()
     begun = time.monotonic()
     new = Page(device, clock=lambda: time.monotonic() - begun)

@@ -13,6 +13,7 @@ from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.errors import XopError
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.reach import compute_forward_reach
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
 from xop_lerobot.operator.clutch import Clutch
@@ -23,9 +24,9 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import GestureConfig, grip_from_pinch
 from xop_lerobot.operator.goal_velocity import GoalVelocity
 from xop_lerobot.operator.hand_blend import HandBlend
-from xop_lerobot.operator.hands import Hands
+from xop_lerobot.operator.hands import Hands, explain_gestures
 from xop_lerobot.operator.raised_hands import HOLDING
-from xop_lerobot.operator.telling import tell_changes
+from xop_lerobot.operator.telling import list_warnings, tell_changes
 from xop_lerobot.operator.view import View
 from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.retarget.arm_driver import ArmDriver
@@ -77,6 +78,7 @@ class Teleoperation:
         self.config, self.info, self.morphology = config, info, info.morphology
         self.dt = 1 / info.fps
         self.device = make_device(config.device)
+        self.device.introduce(info.name, explain_gestures(config.gestures))
         self._settings = OnlineSettings(self.morphology, config.retargeter)
         model = build_model(self.morphology, "planning", scene=info.scene)
         policy = make_policy(info.low_level, info.low_level_path)
@@ -96,11 +98,15 @@ class Teleoperation:
         self._hands = Hands(config.gestures, has_person=has_person)
         self._blend = HandBlend() if has_person else None
         self._board = NoticeBoard()
+        reach = None
+        if config.alignment.arm_reach is not None:
+            reach = compute_forward_reach(self.morphology, model)
         self._engagement = Engagement(
             self.device,
             Alignment(config.alignment),
             Clutch(config.gestures.clutch) if has_person else None,
             self._board,
+            robot_reach=reach,
             begin=self._begin_engagement,
             end=self._end_engagement,
         )
@@ -212,7 +218,10 @@ class Teleoperation:
         """
         if self._shown is None:
             return
-        self.device.show(dataclasses.replace(self._shown, progress=progress, pictures=pictures))
+        shown, notices = self._shown, self._board.notices
+        self.device.show(
+            dataclasses.replace(shown, notices=notices, progress=progress, pictures=pictures)
+        )
 
     def take_wishes(self) -> tuple[Wish, ...]:
         """What the operator asks of the recording since the last call, by gestures or buttons."""
@@ -266,17 +275,24 @@ class Teleoperation:
         else:
             wanted = self._drive(state, goal, poses["head"], dt)
         action = self._limit(state, wanted)
-        holding, progress = self._describe_hold(goal is not None)
-        self._shown = Display(
+        self._shown = self._make_display(state, frame, engaged=goal is not None)
+        return action, self._make_record(measured, synced, frame, goal, wanted, changes)
+
+    def _make_display(
+        self, state: RobotState, frame: OperatorFrame | None, *, engaged: bool
+    ) -> Display:
+        holding, progress = self._describe_hold(engaged)
+        current = self._follower.current if engaged else None
+        age = None if current is None else state.time - current.measured
+        return Display(
             time=state.time,
-            engaged=goal is not None,
+            engaged=engaged,
             mode=self._mode,
             clutch=progress,
             holding=holding,
-            notices=self._board.notices,
+            warnings=list_warnings(self.device, frame, engaged=engaged, plan_age=age),
             fallen=state.fallen,
         )
-        return action, self._make_record(measured, synced, frame, goal, wanted, changes)
 
     def _apply_changes(self) -> tuple[AppliedChange, ...]:
         """Put into force what was asked for since the last tick."""

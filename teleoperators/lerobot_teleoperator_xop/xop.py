@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
+import time
 import weakref
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot.teleoperators.teleoperator import Teleoperator
@@ -15,6 +18,13 @@ from xop_lerobot.dataset.host import Host
 from xop_lerobot.errors import LinkError, NotConnected, XopError
 from xop_lerobot.link import RobotInfo, get_session
 from xop_lerobot.mistakes import report_mistakes
+from xop_lerobot.operator.alignment import AlignmentConfig
+from xop_lerobot.operator.calibration import (
+    Calibration,
+    calibrate,
+    load_calibration,
+    save_calibration,
+)
 from xop_lerobot.operator.devices import make_device
 
 if TYPE_CHECKING:
@@ -22,6 +32,8 @@ if TYPE_CHECKING:
 
     from xop_lerobot.control.server import ControlServer
     from xop_lerobot.teleoperation import Teleoperation
+
+logger = logging.getLogger(__name__)
 
 
 class Xop(Teleoperator):
@@ -34,13 +46,15 @@ class Xop(Teleoperator):
 
     Raises:
         UnknownName: If there is no such device.
-        BadValue: If a setting of the device is out of its range or missing.
+        BadValue: If a setting of the device is out of its range or missing, or the operator's
+            calibration cannot be read.
     """
 
     config_class = XopConfig
     name = "xop"
 
     def __init__(self, config: XopConfig) -> None:
+        self.person: Calibration | None = None
         super().__init__(config)
         report_mistakes()
         self.config = config
@@ -53,11 +67,12 @@ class Xop(Teleoperator):
         self._keys: TerminalKeyListener | None = None
         # Refuses a bad device here, before a robot or a dataset exists.
         device = make_device(config.device)
-        self._session.configs["teleop"] = {"type": self.name, **dataclasses.asdict(config)}
+        self._has_person = not device.self_engaging
+        self._note_config()
         self.host = Host(
             config.session,
             extra_columns=config.record.columns,
-            has_person=not device.self_engaging,
+            has_person=self._has_person,
         )
         self.host.install()
         weakref.finalize(self, self.host.remove)
@@ -83,11 +98,56 @@ class Xop(Teleoperator):
 
     @property
     def is_calibrated(self) -> bool:
-        """True: there is nothing to calibrate."""
-        return True
+        """Whether the operator's height and reach are known, where a person drives."""
+        return self.person is not None or not self._has_person
 
     def calibrate(self) -> None:
-        """Do nothing."""
+        """Measure the operator's height and reach, and keep them in LeRobot's folder.
+
+        Raises:
+            NotConnected: Before `connect()`.
+            XopError: If a robot is driven already, or the person could not be measured.
+        """
+        if not self._is_connected:
+            raise NotConnected(type(self).__name__)
+        if not self._has_person:
+            logger.info("Device '%s' needs no calibration.", self.config.device.type)
+            return
+        if self._teleoperation is not None:
+            raise XopError("a robot is driven already; calibrate with lerobot-calibrate")
+        device = make_device(self.config.device)
+        device.connect()
+        try:
+            self.person = calibrate(device, say=logger.info, clock=time.monotonic, sleep=time.sleep)
+        finally:
+            device.disconnect()
+        self._save_calibration()
+        self._note_config()
+        logger.info("Saved for '--teleop.id=%s' in '%s'.", self.id, self.calibration_fpath)
+
+    def _load_calibration(self, fpath: Path | None = None) -> None:
+        self.person = load_calibration(fpath or self.calibration_fpath)
+
+    def _save_calibration(self, fpath: Path | None = None) -> None:
+        assert self.person is not None
+        save_calibration(self.person, fpath or self.calibration_fpath)
+
+    def _make_alignment(self) -> AlignmentConfig:
+        """The alignment of the flags, with what the calibration knows of the operator."""
+        flags = self.config.alignment
+        if self.person is None or not self._has_person:
+            return flags
+        return dataclasses.replace(
+            flags,
+            eye_height=flags.eye_height or self.person.eye_height,
+            arm_reach=flags.arm_reach or self.person.arm_reach,
+        )
+
+    def _note_config(self) -> None:
+        """Publish the configuration, which is saved with a dataset."""
+        alignment = dataclasses.asdict(self._make_alignment())
+        config = dataclasses.asdict(self.config) | {"alignment": alignment}
+        self._session.configs["teleop"] = {"type": self.name, **config}
 
     def configure(self) -> None:
         """Do nothing."""
@@ -101,12 +161,17 @@ class Xop(Teleoperator):
             LinkError: If there are two robots in the session.
             BadRecording: If a recording is missing or malformed.
         """
-        del calibrate
         if self._is_connected:
             return
+        if calibrate and not self.is_calibrated:
+            logger.info(
+                "No calibration of '--teleop.id=%s': your height is measured when you engage, and "
+                "your arms count as long as your height says. lerobot-calibrate measures both.",
+                self.id,
+            )
         if self.action_features:
             self._teleoperation = self._make_teleoperation(self._session.robot)
-        else:
+        elif not self._has_person:
             device = make_device(self.config.device)
             device.connect()
             device.disconnect()
@@ -169,7 +234,7 @@ class Xop(Teleoperator):
 
         config = TeleoperationConfig(
             device=self.config.device,
-            alignment=self.config.alignment,
+            alignment=self._make_alignment(),
             retargeter=self.config.retargeter,
             gestures=self.config.gestures,
         )

@@ -126,9 +126,10 @@ class WorldAlignment(Alignment):
         frame: OperatorFrame,
         robot_frames: Mapping[str, np.ndarray],
         robot_head_height: float,
+        robot_reach: float | None = None,
     ) -> None:
         """Begin to give goals."""
-        del frame, robot_frames, robot_head_height
+        del frame, robot_frames, robot_head_height, robot_reach
         self._engaged = True
 
     def disengage(self) -> None:

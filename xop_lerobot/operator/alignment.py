@@ -25,6 +25,7 @@ from xop_lerobot.transforms import (
 MIN_OPERATOR_HEIGHT = 0.5
 """Head height of a person under which the device's origin is surely not the floor [m]."""
 SCALES = ("height_scale", "reach_scale", "walk_scale")
+LENGTHS = ("eye_height", "arm_reach")
 
 
 class EngageRefused(XopError):
@@ -43,10 +44,14 @@ class AlignmentConfig:
     """How the operator's motion is scaled to the robot.
 
     Attributes:
-        height_scale: Robot's over operator's change of head height; None measures the ratio of
-            the two head heights at engage.
-        reach_scale: Robot's over operator's distance from head to wrist; None is the same as
-            the height scale.
+        height_scale: Robot's over operator's change of head height; None is the ratio of the
+            two head heights.
+        reach_scale: Robot's over operator's distance from head to wrist; None is the ratio of
+            their reaches where the operator's is known, else the same as the height scale.
+        eye_height: The operator's head height, upright [m]; None measures it at engage. A
+            calibration knows it.
+        arm_reach: Horizontal distance from the operator's head to the wrists, arms stretched
+            forward [m]; None: not known. A calibration knows it.
         walk_scale: Robot's over operator's horizontal travel.
         frames: Which frames get a goal; the head is followed for alignment in any case.
     """
@@ -54,16 +59,19 @@ class AlignmentConfig:
     height_scale: float | None = None
     reach_scale: float | None = None
     walk_scale: float = 1.0
+    eye_height: float | None = None
+    arm_reach: float | None = None
     frames: tuple[str, ...] = FRAMES
 
     def __post_init__(self) -> None:
         """Check every value.
 
         Raises:
-            BadValue: If a scale is not a finite number above 0, or there is no frame.
+            BadValue: If a scale or a length is not a finite number above 0, or there is no
+                frame.
             UnknownName: If a frame is unknown, with the known ones.
         """
-        for name in SCALES:
+        for name in (*SCALES, *LENGTHS):
             scale = getattr(self, name)
             if scale is not None and not (math.isfinite(scale) and scale > 0):
                 raise BadValue(f"alignment.{name} must be finite and above 0, got {scale}")
@@ -145,6 +153,7 @@ class Alignment:
         frame: OperatorFrame,
         robot_frames: Mapping[str, np.ndarray],
         robot_head_height: float,
+        robot_reach: float | None = None,
     ) -> None:
         """Lay the operator's head and heading on the robot's, measured now.
 
@@ -152,6 +161,8 @@ class Alignment:
             frame: The operator now.
             robot_frames: Pose of the head and of every frame of the config, robot world (7,).
             robot_head_height: Height of the robot's head over the ground [m].
+            robot_reach: Horizontal distance from the robot's head to its wrists, arms stretched
+                forward [m]; None where it is not known.
 
         Raises:
             EngageRefused: If the head is not tracked, or is too low to be over the floor.
@@ -167,7 +178,7 @@ class Alignment:
             robot=robot["head"],
             turn=quat_from_yaw(heading),
             height_scale=height_scale,
-            reach_scale=self.config.reach_scale or height_scale,
+            reach_scale=self._find_reach_scale(robot_reach) or height_scale,
         )
         # A wrist that is not seen yet is wanted where the robot has it.
         body = pose_inverse(_level(robot["head"]))
@@ -232,7 +243,13 @@ class Alignment:
             )
         if not robot_head_height > 0:
             raise BadValue(f"robot_head_height must be above 0 m, got {robot_head_height}")
-        return robot_head_height / height
+        return robot_head_height / (self.config.eye_height or height)
+
+    def _find_reach_scale(self, robot_reach: float | None) -> float | None:
+        """The reach scale, None where it is that of heights."""
+        if self.config.reach_scale is not None or self.config.arm_reach is None:
+            return self.config.reach_scale
+        return None if robot_reach is None else robot_reach / self.config.arm_reach
 
     def _check_engaged(self) -> _Anchor:
         if self._anchor is None:

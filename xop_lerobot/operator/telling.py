@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from xop_lerobot.operator.device import Device
+from xop_lerobot.operator.devices.live import LiveDevice
 from xop_lerobot.operator.display import Cue, NoticeBoard
+from xop_lerobot.operator.frame import OperatorFrame
 
 if TYPE_CHECKING:
     from xop_lerobot.retarget.changes import Change
     from xop_lerobot.retarget.online import AppliedChange
+
+HANDS = ("left", "right")
+SLOW_HZ = 25.0
+"""Rate of a stream under which gestures are missed [Hz]."""
+LATE_S = 0.3
+"""Age of a plan from which the robot lags behind what is asked of it [s]."""
 
 
 def tell_changes(board: NoticeBoard, changes: Iterable[AppliedChange]) -> None:
@@ -38,3 +48,36 @@ def describe_settings(change: Change) -> str:
         parts.append(f"body {', '.join(change.body) or 'whole'}")
     text = "; ".join(parts)
     return text[:1].upper() + text[1:]
+
+
+def list_warnings(
+    device: Device, frame: OperatorFrame | None, *, engaged: bool, plan_age: float | None
+) -> tuple[str, ...]:
+    """List what is wrong now, the worst first.
+
+    Args:
+        device: Where the operator's motion comes from.
+        frame: The operator now, None before the first frame.
+        engaged: Whether the operator drives.
+        plan_age: Age of the plan that is followed [s], None where there is none.
+    """
+    warnings = [device.trouble] if device.trouble else []
+    if frame is not None and not frame.tracked[0]:
+        if not warnings:
+            warnings.append("The headset does not see where it is, or sends nothing.")
+    elif frame is not None:
+        lost = [side for side, seen in zip(HANDS, frame.tracked[1:], strict=True) if not seen]
+        if lost:
+            hands = f"{lost[0]} hand is" if len(lost) == 1 else "hands are"
+            stands = f": {'its arm stands' if len(lost) == 1 else 'the arms stand'} still"
+            warnings.append(f"Your {hands} not seen{stands if engaged else ''}.")
+        rate = device.status.rate if isinstance(device, LiveDevice) else math.inf
+        if rate < SLOW_HZ:
+            warnings.append(
+                f"Only {rate:.0f} poses arrive in a second: gestures need {SLOW_HZ:.0f}."
+            )
+    if plan_age is not None and plan_age > LATE_S:
+        warnings.append(
+            f"The plan is {plan_age:.1f} s old: this computer is too slow for the planner."
+        )
+    return tuple(warnings)

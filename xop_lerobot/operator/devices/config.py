@@ -38,6 +38,8 @@ class DeviceConfig:
             where browsers ask for none.
         code: `webxr`: pairing code, at least 6 letters or digits; None makes one for each
             session.
+        smoothing: `avp`, `webxr`: how much head and wrists are smoothed while they rest, 0 not
+            at all (`OneEuro`).
         max_delay_s: `webxr`: frames that are older on their arrival are dropped, so that the
             operator lets go when all are [s].
     """
@@ -56,6 +58,7 @@ class DeviceConfig:
     tls: bool | None = None
     code: str | None = None
     max_delay_s: float = 0.3
+    smoothing: float = 1.0
 
     def __post_init__(self) -> None:
         """Check every value.
@@ -71,6 +74,7 @@ class DeviceConfig:
         _check_at_least("device.noise", self.noise, 0)
         _check_at_least("device.seed", self.seed, 0)
         _check_at_least("device.port", self.port, 0)
+        _check_at_least("device.smoothing", self.smoothing, 0)
         for name in ("stale_s", "max_delay_s", "speed"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):

@@ -17,6 +17,7 @@ from xop_lerobot.errors import XopError
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.one_euro import OneEuro, make_one_euro
 from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
 
 logger = logging.getLogger(__name__)
@@ -62,9 +63,9 @@ class LiveDevice(Device):
     """A headset that somebody wears now.
 
     Its stream is read on a thread of its own, as fast as it comes, and each frame is stamped at
-    its receipt and judged at once; only the newest is kept. So `read` never waits, and nothing
-    queues up: however slow the readers are, what they get is never older than the stream. When
-    no believable frame came for `stale` seconds, `read` says that nothing is tracked. The
+    its receipt, judged and smoothed at once; only the newest is kept. So `read` never waits, and
+    nothing queues up: however slow the readers are, what they get is never older than the stream.
+    When no believable frame came for `stale` seconds, `read` says that nothing is tracked. The
     connection is made anew by itself whenever it ends.
 
     A subclass implements `stream` and `interrupt`, and calls `receive` with each frame.
@@ -84,6 +85,7 @@ class LiveDevice(Device):
         self.config = config
         self.start_mode = config.start_mode
         self.guard = StreamGuard(guard or GuardConfig(stale=config.stale_s))
+        self._filter: OneEuro | None = make_one_euro(config.smoothing)
         self.clock = clock
         self.handled = 0
         """Messages that were dealt with, of whatever kind."""
@@ -163,6 +165,8 @@ class LiveDevice(Device):
                 return
             # After a pause somebody else's head may be in it, anywhere.
             self.guard.reset()
+            if self._filter is not None:
+                self._filter.reset()
             self._relocations += self._connections > 0
             self._connected = True
             self._connections += 1
@@ -188,6 +192,10 @@ class LiveDevice(Device):
             stamped = dataclasses.replace(frame, time=self.clock())
             taken = self.guard.take(stamped, source_time)
             self._relocations += self.guard.relocations - relocations
+            if self._filter is not None and self.guard.relocations != relocations:
+                self._filter.reset()
+            if taken is not None and self._filter is not None:
+                taken = self._filter.smooth(taken)
             if taken is not None:
                 self._newest, self._left = taken, False
                 self._stamps.append(taken.time)
