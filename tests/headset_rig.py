@@ -86,9 +86,10 @@ class Rig:
             for k in range(RATE // FPS):
                 self.now = start + i / FPS + (k + 1) / RATE
                 for message in fault(self.now - start, make_person(self.now, gesture)):
+                    self.now += 1e-5  # no two messages come at once
                     self._send(message)
                     self.sent += 1
-                wait_for(lambda: self.device.handled >= self.sent)
+                    wait_for(lambda: self.device.handled >= self.sent)
             action, record = self.teleop.step(self.loop.state)
             self.loop.execute(action, 1 / FPS)
             self.ticks.append((action, record))

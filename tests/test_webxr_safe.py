@@ -146,7 +146,7 @@ def test_what_may_not_be_sent_ends_the_connection(device, message, reason):
     page.send(message)
     assert find_refusal(page) == reason
     wait_for(lambda: not device.status.connected)
-    assert device.status.trouble == reason
+    assert device.status.trouble == f"the page was shut out: {reason}"
     assert not device.read(0.0).tracked.any()
 
 

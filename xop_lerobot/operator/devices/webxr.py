@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 
 LOOPBACK = "127.0.0.1"
 BACKLOG = 16
+FUTURE_S = 0.05
+"""Clocks drift apart by less than that from ping to ping [s]."""
 
 
 class PortTaken(XopError):
@@ -187,12 +189,16 @@ class WebXrDevice(LiveDevice):
         if measured is None:
             self.refuse("clock_unknown")
             return
+        delay, error = measured
+        if delay < -error - FUTURE_S:  # nothing after it would count as new
+            self.refuse("from_the_future")
+            return
         if not self._connected:
             with self._lock:
                 self._delay.reset()
         self.hear()
         with self._lock:
-            late = self._delay.take(now, *measured)
+            late = self._delay.take(now, max(delay, 0.0), error)
             trouble = self._delay.describe(now) if late and not self._was_late else ""
         if trouble:
             logger.warning(trouble)

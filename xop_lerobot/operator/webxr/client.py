@@ -68,12 +68,11 @@ class Client:
         """How long ago a frame that comes at `time` [s] was sent.
 
         Returns:
-            Delay and how far it may be off [s]; None while no ping was answered.
+            Delay, below 0 for frames of the future, and how far it may be off [s]; None while no
+            ping was answered.
         """
         best = self._offset.best
-        if best is None:
-            return None
-        return max(time - (message.sent - best.offset), 0.0), best.error
+        return None if best is None else (time - (message.sent - best.offset), best.error)
 
     async def send_on(
         self,

@@ -62,6 +62,7 @@ class DelayMeter:
         if delay is None:
             return ""
         if self._frames[-1][2]:
+            delay = statistics.median(d for _, d, late in self._frames if late)
             return (
                 f"the headset's stream is {delay * 1e3:.0f} ms late and is not followed beyond "
                 f"{self._limit * 1e3:.0f} ms: free the network, or raise device.max_delay_s"

@@ -206,7 +206,7 @@ class HeadsetServer:
         finally:
             sender.cancel()
             self._clients.discard(client)
-            self._forget(client, "the connection was closed")
+            self._forget(client, "the page has closed the connection")
         return ws
 
     async def _find_no_room(self, client: Client) -> str | None:
@@ -235,11 +235,11 @@ class HeadsetServer:
         """Take what `client` sends until it leaves or does what it may not."""
         async for message in client.ws:
             if message.type is not WSMsgType.TEXT:
-                await self._dismiss(client, "only text is taken here")
-                return
-            reason = self._take(client, message.data)
+                reason: str | None = "only text is taken here"
+            else:
+                reason = self._take(client, message.data)
             if reason is not None:
-                logger.warning("WebXR: the connection was closed: %s.", reason)
+                self._forget(client, f"the page was shut out: {reason}")
                 await self._dismiss(client, reason)
                 return
 
