@@ -56,11 +56,23 @@ WEARER = """
     { ...IWER.metaQuest3, supportedSessionModes: MODES }, { stereoEnabled: true });
   device.installRuntime({ forceInstall: true });
   device.primaryInputMode = 'hand';
-  const wearer = { still: false, pose: null, pinch: [0, 0], person: null };
+  const wearer = { still: false, pose: null, pinch: [0, 0], person: null, guessed: false };
   window.device = device;
   window.wearer = wearer;
   wearer.embody = async () => {
     wearer.person = new (await import('/standin.js')).StandIn();
+  };
+  // The emulator calls every controller's place guessed; here, hands and controllers are on demand.
+  Object.defineProperty(XRPose.prototype, 'emulatedPosition', {
+    get() { return wearer.guessed && !(this instanceof XRViewerPose); },
+  });
+  // The emulator holds a hand at its ray, against which the wrist of a pinch is turned like this.
+  const straighten = (pose, side) => {
+    if (side < 0) return pose;
+    const [x, y, z, w] = [-0.3080, side ? -0.2148 : 0.2148, side ? -0.0281 : 0.0281, 0.9264];
+    const [a, b, c, d] = pose.slice(3);
+    return [...pose.slice(0, 3), d * x + a * w + b * z - c * y, d * y - a * z + b * w + c * x,
+      d * z + a * y - b * x + c * w, d * w - a * x - b * y - c * z];
   };
   const put = (target, [x, y, z, qx, qy, qz, qw], sway) => {
     target.position.set(x + sway[0], y + sway[1], z + sway[2]);
@@ -75,7 +87,7 @@ WEARER = """
     if (person) {
       person.step(t - last);
       const { head, left, right, pinch } = person.pose;
-      wearer.pose = [head, left, right];
+      wearer.pose = [head, left, right].map((pose, i) => straighten(pose, i - 1));
       wearer.pinch = pinch.map((distance) => Math.min(Math.max((0.08 - distance) / 0.072, 0), 1));
     }
     last = t;

@@ -20,6 +20,7 @@ const GROUPS = [
   ]],
   ['Hands', [
     ['Digit1', '1', 'pinch left', 'pinchLeft'], ['Digit2', '2', 'pinch right', 'pinchRight'],
+    ['KeyZ', 'Z', 'raise left', 'raiseLeft'], ['KeyX', 'X', 'raise right', 'raiseRight'],
     ['KeyP', 'P', 'palms inwards, down', '!palms'],
   ]],
 ];

@@ -151,7 +151,7 @@ class App {
       byId('nothing').hidden = true;
       this.hud.picture?.close();
       this.hud.picture = picture;
-      paint(byId('camera'), picture);
+      if (!this.headset) paint(byId('camera'), picture); // in a headset nobody sees the page
       return;
     }
     const id = `camera-${camera}`;

@@ -19,13 +19,14 @@ const REACH = { min: [0, -0.9, -0.75], max: [0.65, 0.2, -0.12] }; // the same, o
 const HAND_S = 0.3;
 const HAND_SPEED = 1.2; // [m/s]
 const PALMS_S = 0.5;
+const RAISED = [0.24, -0.2, -0.36]; // of a right hand that says halt, from the head [m]
 const OPEN = 0.08; // distance of thumb and index [m]
 const CLOSED = 0.008;
 const PINCH_S = 0.09;
 const TAP = [0, 0.18, 0.36, 0.54]; // a double pinch: closes, opens, closes, opens [s]
 const LONGEST = 0.04; // however long the browser paused, nobody has moved for longer [s]
 
-/** What `hold` and `release` know, by name; the walk and the like as speeds. */
+/** What `hold` and `release` know besides gestures: kinds of speed, and their signs. */
 export const DRIVES = {
   forward: ['walk', 0, -1], back: ['walk', 0, 1], left: ['walk', -1, 0], right: ['walk', 1, 0],
   turnLeft: ['turn', 1], turnRight: ['turn', -1],
@@ -47,12 +48,13 @@ export class StandIn {
     this.hands = SIDES.map((_, i) => new Glide([i ? HAND.x : -HAND.x, HAND.y, HAND.z]));
     this.palms = new Glide([0]); // turned about the fingers: 0 down, π up [rad]
     this.facing = new Glide([0]); // 1: the palms face each other
+    this.raises = SIDES.map(() => new Glide([0])); // 1: fingers up, palm forward
     this.pinches = SIDES.map(() => new Glide([OPEN]));
     this.held = new Set();
     this.taps = [null, null]; // when the double pinch of a hand began [s]
   }
 
-  /** Begin to do something: a name of `DRIVES`, `engage`, `pinchLeft` or `pinchRight`. */
+  /** Begin to do something: a name of `DRIVES`, `engage`, or `pinch` or `raise` with a side. */
   hold(name) {
     this.held.add(name);
   }
@@ -130,6 +132,10 @@ export class StandIn {
     const engaging = this.held.has('engage');
     this.palms.aim([engaging ? Math.PI : 0], PALMS_S);
     this.palms.step(dt);
+    this.raises.forEach((raise, side) => {
+      raise.aim([this.held.has(side ? 'raiseRight' : 'raiseLeft') ? 1 : 0], PALMS_S);
+      raise.step(dt);
+    });
     this.pinches.forEach((pinch, side) => {
       const began = this.taps[side];
       const since = began === null ? -1 : this.time - began;
@@ -156,12 +162,16 @@ export class StandIn {
     const wrists = this.hands.map((hand, side) => {
       const mirror = side ? 1 : -1;
       const tremor = [0, 1, 2].map((i) => 0.001 * Math.sin((2.1 + 0.7 * i) * t + i + 2 * side));
-      const from = rotate(level, hand.value.map((value, i) => value + tremor[i]));
+      const raised = this.raises[side].value[0];
+      const high = [mirror * RAISED[0], RAISED[1], RAISED[2]];
+      const place = hand.value.map((value, i) => value + raised * (high[i] - value) + tremor[i]);
+      const from = rotate(level, place);
       // About the fingers (-z): the thumbs turn outwards for palms up, and up for palms inwards.
       const roll = mirror * (this.palms.value[0] + (this.facing.value[0] * Math.PI) / 2
         * (1 - this.palms.value[0] / Math.PI));
+      const lift = multiply(level, turnAbout(RIGHT, (raised * Math.PI) / 2));
       return [...head.map((value, i) => value + from[i]),
-        ...multiply(level, turnAbout(BACK, -roll))];
+        ...multiply(lift, turnAbout(BACK, -roll))];
     });
     const [left, right] = wrists;
     return { head: [...head, ...look], left, right, pinch: this.pinches.map((p) => p.value[0]) };
