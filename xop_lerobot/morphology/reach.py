@@ -38,7 +38,9 @@ def _compute_length(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmChain, s
     rng = np.random.default_rng(0)
     joints = [model.joint(name) for name in arm.joints]
     addresses = [int(joint.qposadr[0]) for joint in joints]
-    low, high = np.array([joint.range for joint in joints]).T
+    full = np.array([-np.pi, np.pi])
+    ranges = [joint.range if model.jnt_limited[joint.id] else full for joint in joints]
+    low, high = np.array(ranges).T
     first = data.joint(arm.joints[0])
 
     def measure(angles: np.ndarray) -> float:

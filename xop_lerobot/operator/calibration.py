@@ -33,6 +33,8 @@ SHOULDERS = (0.0, 0.5)
 MAX_GAP = 0.3
 """Longest time without a frame [s]."""
 RATE_HZ = 50.0
+HINT_S = 2.0
+"""What is wrong for so long is said [s]."""
 
 
 class CalibrationFailed(XopError):
@@ -215,30 +217,47 @@ def calibrate(
     Raises:
         CalibrationFailed: If it is; says what was missing.
     """
-    guide, board, told = Guide(), NoticeBoard(), ""
-    end = clock() + patience_s
+    guide, board = Guide(), NoticeBoard()
+
+    def tell(cue: Cue, text: str) -> None:
+        say(text)
+        board.post(cue, text)
+
+    begun = hinted = clock()
+    step, hint = None, ""
     while guide.result is None:
         now = clock()
         guide.update(device.read(now))
-        text = guide.step.value if not guide.hint else f"{guide.step.value} {guide.hint}"
-        if guide.step is Step.WAIT and device.trouble:
-            text = f"{guide.step.value} {device.trouble}"
-        if text != told:
-            say(text)
-            board.post(Cue.SETTING, text)
-            told = text
-        device.show(
-            Display(now, notices=board.notices, clutch=guide.progress, holding=guide.step.value)
+        problem = guide.hint
+        if guide.step is Step.WAIT:
+            problem = device.trouble or problem
+        if guide.step is not step:
+            step, hint, hinted = guide.step, "", now
+            tell(Cue.SETTING, step.value)
+        elif problem != hint and now - hinted >= HINT_S:
+            # Who is still about to do it needs no hint yet.
+            hint, hinted = problem, now
+            if problem:
+                tell(Cue.REFUSED, problem)
+        elif not problem:
+            hinted = now
+        shown = Display(
+            now,
+            notices=board.notices,
+            warnings=(problem,) if problem else (),
+            clutch=guide.progress,
+            holding=guide.step.value,
         )
-        if now > end:
-            raise CalibrationFailed(f"nothing was measured within {patience_s:g} s: {text}")
+        device.show(shown)
+        if now - begun > patience_s:
+            missing = f"{guide.step.value} {problem}".strip()
+            raise CalibrationFailed(f"nothing was measured within {patience_s:g} s: {missing}")
         sleep(1 / RATE_HZ)
     result = guide.result
-    text = (
+    tell(
+        Cue.SUCCESS,
         f"Measured: eyes {result.eye_height:.2f} m over the floor, arms reach "
-        f"{result.arm_reach:.2f} m forward."
+        f"{result.arm_reach:.2f} m forward.",
     )
-    say(text)
-    board.post(Cue.SUCCESS, text)
     device.show(Display(clock(), notices=board.notices))
     return result
