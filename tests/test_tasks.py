@@ -38,9 +38,11 @@ def test_reach_is_where_the_palms_are(robot):
 # dual-point touch
 
 
-def draw_points(robot: str, seeds: range) -> list[tuple[np.ndarray, np.ndarray, float]]:
+def draw_points(
+    robot: str, seeds: range, task: str = "dual_point_touch"
+) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Left point, right point [m] and the heading that faces them, by seed."""
-    stage = Stage(make_morphology(robot), "dual_point_touch")
+    stage = Stage(make_morphology(robot), task)
     drawn = []
     for seed in seeds:
         stage.reset(seed)
@@ -96,6 +98,40 @@ def test_low_points_ask_for_a_squat():
     lowest = min(left[2] for left, _, _ in draw_points("g1", range(40)))
     # From the shoulder down and forward to where the palms are at rest.
     assert lowest < reach.shoulder - np.sqrt(reach.arm**2 - 0.2**2)
+
+
+# dual-point reach
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_near_points_are_within_an_arms_length(robot):
+    """From the shoulders of a robot that stays where it is."""
+    morphology = make_morphology(robot)
+    model = morphology.build_spec("full").compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = morphology.standing_qpos()
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    shoulders = [data.xanchor[model.joint(arm.joints[0]).id] for arm in morphology.arms]
+    reach = measure_reach(morphology)
+    for left, right, _ in draw_points(robot, range(60), "dual_point_reach"):
+        for shoulder, point in zip(shoulders, (left, right), strict=True):
+            assert np.linalg.norm(point - shoulder) < reach.arm
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_near_points_are_in_the_head_cameras_picture(robot):
+    """Their middles are, at the start: who sees them need not look about."""
+    stage = Stage(make_morphology(robot), "dual_point_reach")
+    model, data = stage.plant.model, stage.plant.data
+    camera = model.camera("head").id
+    edge = np.tan(np.radians(model.cam_fovy[camera]) / 2) * np.array([4 / 3, 1])
+    for seed in range(60):
+        stage.reset(seed)
+        for point in ("left_point", "right_point"):
+            offset = stage.task.objects[point].pose[:3] - data.cam_xpos[camera]
+            right, up, back = data.cam_xmat[camera].reshape(3, 3).T @ offset
+            assert (np.abs([right, up]) < -back * edge).all(), seed
 
 
 # box pick-and-place

@@ -71,7 +71,7 @@ class Host:
         self._session = session
         self._extra_columns = extra_columns
         self._has_person = has_person
-        self._stock: list[tuple[ModuleType, str, object, object]] = []
+        self._stock: list[tuple[ModuleType | type, str, object, object]] = []
         self._terminator = TermAsInterrupt()
 
     def install(self) -> None:
@@ -97,8 +97,20 @@ class Host:
                 loop = module.record_loop
                 stock = getattr(loop, "xop_stock", loop)
                 self._replace(module, "record_loop", self._wrap_loop(stock))
+        self._hold_policies_to_length()
         if threading.current_thread() is threading.main_thread():
             self._terminator.install()
+
+    def _hold_policies_to_length(self) -> None:
+        """Let `lerobot-rollout` count frames too, where its loop is as it was."""
+        from xop_lerobot.dataset import rollout_loop  # noqa: PLC0415  brings torch
+
+        strategy = rollout_loop.find_strategy(find(rollout_loop.STRATEGY_MODULE))
+        if strategy is not None:
+            loop = getattr(strategy, rollout_loop.LOOP)
+            stock = getattr(loop, "xop_stock", loop)
+            ours = rollout_loop.count_in_frames(stock, self._session)
+            self._replace(strategy, rollout_loop.LOOP, ours)
 
     def remove(self) -> None:
         """Put LeRobot's own names back; may be called twice."""
@@ -109,7 +121,7 @@ class Host:
         self._stock.clear()
         self._terminator.remove()
 
-    def _replace(self, module: ModuleType, name: str, ours: Any) -> None:
+    def _replace(self, module: ModuleType | type, name: str, ours: Any) -> None:
         current = getattr(module, name)
         stock = getattr(current, "xop_stock", current)
         ours.xop_stock = stock
@@ -139,7 +151,7 @@ class Host:
                     # The robot starts over in an observation: not on the episode's time.
                     call["robot"].get_observation()
                 if lockstep:
-                    with _without_slowness():
+                    with without_slowness():
                         stock(**call)
                     return
             stock(**call)
@@ -154,18 +166,22 @@ class Host:
 
 
 @contextmanager
-def _without_slowness() -> Iterator[None]:
-    """Leave out LeRobot's warning of every slow tick: in lock-step none is wrong, only later."""
+def without_slowness(speaker: str | None = None) -> Iterator[None]:
+    """Leave out LeRobot's warning of every slow tick: in lock-step none is wrong, only later.
+
+    Args:
+        speaker: Name of the logger that warns; None for the root.
+    """
 
     def is_other(record: logging.LogRecord) -> bool:
         return not str(record.msg).startswith("Record loop is running slower")
 
-    root = logging.getLogger()
-    root.addFilter(is_other)
+    warner = logging.getLogger(speaker)
+    warner.addFilter(is_other)
     try:
         yield
     finally:
-        root.removeFilter(is_other)
+        warner.removeFilter(is_other)
 
 
 def count_ticks(duration: float, fps: int) -> int:

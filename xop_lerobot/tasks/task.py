@@ -122,6 +122,7 @@ def get_task(name: str) -> type[Task]:
     """
     from xop_lerobot.tasks import (  # noqa: F401, PLC0415 they register themselves
         box_pick_and_place,
+        dual_point_reach,
         dual_point_touch,
         non_prehensile_transport,
     )

@@ -53,6 +53,15 @@ def touch_two_points(mind: Mind) -> Doing:
         closer += SHIFT if stretched else -SHIFT
 
 
+def reach_two_points(mind: Mind) -> Doing:
+    """Do the same where one stands, as the points are within reach."""
+    yield from find(mind, *POINTS)
+    for _ in range(APPROACHES):
+        yield from hold_points(mind)
+        if mind.eyes.success:
+            return
+
+
 def get_points(mind: Mind) -> dict[str, np.ndarray]:
     """Where the two points are, by the hand that shall touch them. Shapes (3,)."""
     return {side: mind.eyes.pose(f"{side}_point")[:3] for side in SIDES}

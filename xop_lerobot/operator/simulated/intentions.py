@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from xop_lerobot.operator.simulated.box_pick_and_place import carry_box
-from xop_lerobot.operator.simulated.dual_point_touch import touch_two_points
+from xop_lerobot.operator.simulated.dual_point_touch import (
+    reach_two_points,
+    touch_two_points,
+)
 from xop_lerobot.operator.simulated.mind import Doing, Mind
 from xop_lerobot.operator.simulated.non_prehensile_transport import carry_toy, meet_hand
 from xop_lerobot.registry import Registry
@@ -13,6 +16,7 @@ from xop_lerobot.registry import Registry
 INTENTIONS: Registry[Callable[[Mind], Doing]] = Registry("task of the simulated operator")
 """What the person does for each task, as a generator over ticks."""
 INTENTIONS.add("dual_point_touch", touch_two_points)
+INTENTIONS.add("dual_point_reach", reach_two_points)
 INTENTIONS.add("box_pick_and_place", carry_box)
 INTENTIONS.add("non_prehensile_transport", carry_toy)
 
