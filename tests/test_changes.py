@@ -26,6 +26,7 @@ from xop_lerobot.retarget.changes import (
 from xop_lerobot.retarget.config import PRESETS, CostWeights, RetargeterConfig
 from xop_lerobot.retarget.online import OnlineSettings
 from xop_lerobot.retarget.presets import build_configs
+from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_multiply, rotation_error
 
 OPEN = np.full(2, 0.08)
 
@@ -294,6 +295,30 @@ def test_a_hand_that_drives_torso_and_arm_and_back_makes_no_step(rig):  # noqa: 
         assert decided == ({f"left_arm_{i}" for i in range(7)} if variant == "v2" else set())
     assert_smooth(r, commands, arms)
     assert np.abs(np.diff(arms, axis=0)).max() > 0.001
+
+
+def test_a_hand_that_is_freed_from_a_constraint_turns_to_its_goal_slowly(rig):  # noqa: F811
+    """From how the robot holds its hand, which the constraint kept level, within a second."""
+    r = rig("rby1")
+    tilted = quat_multiply(make_frame(0.0).left_wrist[3:], quat_from_rpy(0.6, 0, 0))
+
+    def motion(t: float):
+        frame = make_frame(t)
+        return dataclasses.replace(frame, left_wrist=make_pose(frame.left_wrist[:3], tilted))
+
+    r.person.motion = motion
+    r.teleop.change({"variant": "v2", "constraints": {"upright": True}})
+    for _ in range(40):
+        _, record = r.tick()
+    held = r.teleop._compute_frames(record.state)["left_wrist"]
+    asked = record.goal.poses["left_wrist"]
+    assert np.linalg.norm(rotation_error(asked[3:], held[3:])) > 0.4
+    r.teleop.change({"constraints": {"upright": False}})
+    goals = [record.goal.poses["left_wrist"] for _, record in r.run(1.3)]
+    away = [float(np.linalg.norm(rotation_error(goal[3:], held[3:]))) for goal in goals]
+    assert away[0] < 0.05
+    assert np.diff(away).max() < 0.1
+    np.testing.assert_allclose(goals[-1], asked, atol=1e-3)
 
 
 def test_a_refused_change_changes_nothing_in_mid_motion(rig):  # noqa: F811

@@ -41,7 +41,7 @@ from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.retarget.smoothing import CommandSmoother
 from xop_lerobot.retarget.state_sync import StateSync, Synced
-from xop_lerobot.state import Goal, RobotState
+from xop_lerobot.state import FRAMES, Goal, RobotState
 
 
 @dataclass
@@ -96,7 +96,8 @@ class Teleoperation:
         self._velocity = GoalVelocity()
         has_person = not self.device.self_engaging
         self._hands = Hands(config.gestures, has_person=has_person)
-        self._blend = HandBlend() if has_person else None
+        self._has_person = has_person
+        self._blend = HandBlend()
         self._board = NoticeBoard()
         reach = None
         if config.alignment.arm_reach is not None:
@@ -269,7 +270,8 @@ class Teleoperation:
             source = "gesture" if frame is None or frame.mode is None else "device"
             changes = (*changes, AppliedChange(source, Change(mode=self._mode)))
         tell_changes(self._board, changes)
-        goal = self._make_goal(state, frame) if frame is not None else None
+        freed = poses if any(each.change.constraints for each in changes) else None
+        goal = None if frame is None else self._make_goal(state, frame, freed)
         if goal is None:
             wanted = self._hold(state)
         else:
@@ -332,7 +334,8 @@ class Teleoperation:
     def _begin_engagement(self, state: RobotState, poses: Mapping[str, np.ndarray]) -> None:
         self._arms.forget()
         self._velocity.reset()
-        if self._blend is not None:
+        self._blend.reset()
+        if self._has_person:
             self._blend.engage(poses["head"], poses)
         self._follower.reset(state)
 
@@ -361,12 +364,21 @@ class Teleoperation:
             except XopError as refusal:
                 self._board.tell(Cue.REFUSED, f"Not toggled: {refusal}")
 
-    def _make_goal(self, state: RobotState, frame: OperatorFrame) -> Goal | None:
+    def _make_goal(
+        self,
+        state: RobotState,
+        frame: OperatorFrame,
+        freed: Mapping[str, np.ndarray] | None = None,
+    ) -> Goal | None:
+        """The goal of the tick; hands go to it slowly from the poses `freed`, if there are any."""
         if not self.alignment.is_engaged:
             return None
         goals = self.alignment.goal_poses(frame)
-        if self._blend is not None:
-            goals = self._blend.apply(state.time, goals, frame.tracked)
+        if freed is not None:  # what a constraint has kept from its goal shall not jump there
+            self._blend.engage(goals["head"], freed)
+        # A lost hand of a recording stays as the recording shows it.
+        seen = frame.tracked if self._has_person else np.ones(len(FRAMES), dtype=bool)
+        goals = self._blend.apply(state.time, goals, seen)
         velocities = self._velocity.update(state.time, goals)
         return Goal(goals, velocities, self._mode, grip_from_pinch(frame.pinch))
 

@@ -50,6 +50,8 @@ AHEAD = (0.0, 0.08)
 """The opening is so far ahead of the toy at the start [m]."""
 FREE, SPREAD = 0.05, 0.04
 """Free space between hand and obstacle on either side, and what is added at random [m]."""
+FALL = 0.065
+"""The toy falls so far beyond the edge of the palm that is rolled over [m], as measured."""
 FAR = 0.26
 """The second obstacle is so far beyond the opening [m]."""
 RIM = (0.10, 0.06)
@@ -123,9 +125,15 @@ class NonPrehensileTransport(Task):
           and over it out of the palm.
         - `edge`: from the middle of the palm to the edge that the toy slides over when the palm
           is rolled to the right.
+        - `fall`: how far beyond that edge it falls.
         """
         toy = self.toy_in_palm
-        return {"toy_forward": float(toy[0]), "toy_over": float(-toy[2]), "edge": self._edge}
+        return {
+            "toy_forward": float(toy[0]),
+            "toy_over": float(-toy[2]),
+            "edge": self._edge,
+            "fall": FALL,
+        }
 
     @property
     def _edge(self) -> float:
@@ -199,7 +207,7 @@ class NonPrehensileTransport(Task):
         # From left to right: the hand, free space, the obstacle, free space, the hand beside the
         # opening, over which the toy falls from the hand's edge.
         obstacle = edge + FREE + OBSTACLE[0] + rng.uniform(0, SPREAD)
-        across = obstacle + OBSTACLE[0] + FREE + 2 * edge + 0.01 + rng.uniform(0, SPREAD)
+        across = obstacle + OBSTACLE[0] + FREE + 2 * edge + FALL + rng.uniform(0, SPREAD)
         forward = self.toy_in_palm[0] + rng.uniform(*AHEAD)
         opening = origin + forward * ahead - across * left
         opening[2] = start[2] - rng.uniform(*sorted(RIM))

@@ -100,6 +100,10 @@ class Mind:
         """By how much a movement of this length misses [m]. Shape (size,)."""
         return self.person.scatter * length * self.rng.standard_normal(size)
 
+    def miss_level(self) -> np.ndarray:
+        """Roll and pitch of a hand that is believed to be level [rad]. Shape (2,)."""
+        return self.person.level_error * self.rng.standard_normal(2)
+
     def make_frame(self, stamp: float) -> OperatorFrame:
         """Frame of the body as it is now."""
         return self.body.make_frame(stamp)

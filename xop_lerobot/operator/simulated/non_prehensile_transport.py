@@ -30,14 +30,16 @@ OVER_RIM = 0.08
 """The palm tips so far over the rim [m]."""
 EDGE = 0.04
 """From the middle of a palm to its edge, for who does not know the hand [m]."""
-BEYOND_EDGE = 0.04
-"""The toy falls so far beyond the edge of the palm [m]."""
+FALL = 0.065
+"""The toy falls so far beyond that edge [m], likewise."""
 FREE = 0.12
 """The hand starts so far to the left of the first obstacle [m]."""
 CARRY_SPEED = 0.10
 """Mean speed of a hand on which something lies loose [m/s]."""
 AIM = (0.006, 0.015)
 """How well the toy is aimed: along the hand, and across [m]."""
+LOOK_AGAIN_S = 1.0
+"""Before it is tipped, the aim is looked at again after so long [s]."""
 TIP = 1.3
 """Roll that tips the palm [rad]."""
 TIP_S = 1.6
@@ -123,7 +125,7 @@ def compute_spot(mind: Mind, height: float) -> np.ndarray:
     """Where the palm has to be for the toy to fall into the opening. Shape (3,)."""
     opening, ahead, left = compute_axes(mind)
     spot = opening - mind.eyes.recall("toy_forward", 0.0) * ahead
-    spot = spot + (mind.eyes.recall("edge", EDGE) + BEYOND_EDGE) * left
+    spot = spot + (mind.eyes.recall("edge", EDGE) + mind.eyes.recall("fall", FALL)) * left
     return np.array([*spot[:2], height])
 
 
@@ -146,9 +148,10 @@ def carry_to(mind: Mind, point: np.ndarray) -> Doing:
 
 
 def aim(mind: Mind) -> Doing:
-    """Bring the toy beside the opening as precisely as one sees."""
-    opening, ahead, left = compute_axes(mind)
+    """Bring the toy beside the opening as precisely as one sees, and look twice."""
+    looked = False
     for _ in range(2 * mind.person.corrections):
+        opening, ahead, left = compute_axes(mind)
         spot = compute_spot(mind, float(opening[2]) + OVER_RIM)
         error = spot - mind.feel("left_palm")[:3]
         if mind.eyes.sees("toy"):
@@ -158,7 +161,12 @@ def aim(mind: Mind) -> Doing:
         mind.note(f"toy {100 * (error @ ahead):.1f} cm, {100 * (error @ left):.1f} cm beside")
         fine = abs(error @ ahead) <= AIM[0] and abs(error @ left) <= AIM[1]
         if fine and abs(error[2]) <= 1.5 * AIM[1]:
-            return
+            if looked:
+                return
+            looked = True
+            yield from mind.pause(LOOK_AGAIN_S)
+            continue
+        looked = False
         yield from _push(mind, error, gain=mind.person.hand_gain)
 
 
@@ -169,6 +177,8 @@ def tip(mind: Mind) -> Doing:
         mind.body.double_pinch("left", "right")
         yield from mind.finish()
         yield from mind.pause(1.0)
+        # A hand that is free again turns to how the person holds the own, and takes the toy along.
+        yield from aim(mind)
         mind.note("tip")
         room = mind.body.compute_hands_in_room()[0]
         tipped = mind.belief.quat_to_own(compute_palm_up(mind, TIP))
@@ -193,10 +203,8 @@ def _push(mind: Mind, error: np.ndarray, gain: float) -> Doing:
     room = mind.body.compute_hands_in_room()[0]
     step = gain * mind.belief.vector_to_own(error)
     length = float(np.linalg.norm(step))
-    goal = make_pose(
-        room[:3] + step + mind.scatter(0.3 * length),
-        mind.belief.quat_to_own(compute_palm_up(mind)),
-    )
+    level = quat_multiply(compute_palm_up(mind), quat_from_rpy(*mind.miss_level(), 0))
+    goal = make_pose(room[:3] + step + mind.scatter(0.3 * length), mind.belief.quat_to_own(level))
     duration = max(length / CARRY_SPEED, 0.6)
     mind.body.move(mind.body.with_hands_in_room(mind.body.posture, {"left": goal}), duration)
     yield from mind.settle("left_palm")

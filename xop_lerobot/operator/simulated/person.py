@@ -38,6 +38,8 @@ class Person:
         turn_speed: Peak rate of turning the body or the head [rad/s].
         step_length: Distance up to which a person steps sideways or back, rather than turn [m].
         scatter: Standard deviation of where a movement ends, over its length.
+        level_error: Standard deviation of the turn of a hand that is held level by feel, about
+            each axis, drawn anew with each movement [rad].
         gain: Share of a seen error that one correction takes out.
         hand_gain: The same of a hand.
         patience: Longest wait until what is seen stands still [s].
@@ -75,6 +77,7 @@ class Person:
     turn_speed: float = 0.9
     step_length: float = 0.6
     scatter: float = 0.03
+    level_error: float = 0.08
     gain: float = 0.85
     hand_gain: float = 0.75
     patience: float = 1.5
