@@ -72,11 +72,11 @@ class Page:
         answers: bool = True,
         origin: str | None = None,
         reads: bool = True,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self.clock, self.answers = clock, answers
         self.texts: list[dict[str, Any]] = []
         self.pictures: list[bytes] = []
-        tls = None
         if device.certificate is not None:
             tls = ssl.create_default_context(cafile=str(device.certificate.path))
         self.ws = connect(

@@ -10,6 +10,7 @@ from typing import Protocol
 from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from xop_lerobot.operator.display import Wish
 from xop_lerobot.operator.webxr.certificate import Certificate
@@ -132,6 +133,7 @@ class HeadsetServer:
         runner = web.AppRunner(
             app,
             access_log=None,
+            logger=_make_logger(),
             handle_signals=False,
             keepalive_timeout=10.0,
             shutdown_timeout=CLOSE_S,
@@ -281,6 +283,17 @@ class HeadsetServer:
         if client is self._operator:
             self._operator = None
             self._wearer.leave(reason)
+
+
+def _make_logger() -> logging.Logger:
+    """A log that does not grow with whatever somebody sends that is no HTTP."""
+    own = logging.getLogger(f"{__name__}.http")
+    own.addFilter(_is_our_fault)
+    return own
+
+
+def _is_our_fault(record: logging.LogRecord) -> bool:
+    return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
 
 
 def _is_own_page(request: web.Request) -> bool:

@@ -1,0 +1,185 @@
+"""Measure how old a headset's frame is when it is read, and when its command is there.
+
+    python scripts/benchmark_headset.py --seconds 30
+
+A page in a process of its own sends frames over loopback, with the stamps of the clock that all
+processes of a machine share, engages by the gesture and drives a simulated robot in real time. To
+the command, the wait for the next tick of the control loop is part of the delay: half a period on
+average.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import os
+import socket
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+CODE = "BENCHMARK"
+OPEN_S, GESTURE_S = 1.2, 2.0
+"""Hands are open at first, then the gesture is held."""
+LEVEL, TURNED = [0.0, 0, 0, 1], [0.0, 0, 1, 0]
+POLICIES = {"g1": "default", "rby1": "diff_drive"}
+
+
+def make_message(number: int, t: float) -> dict[str, Any]:
+    """Somebody who sways, and holds the gesture from 1.2 to 3.2 s."""
+    gesture = OPEN_S <= t < OPEN_S + GESTURE_S
+    sway = [0.004 * math.sin(3 * t), 0.004 * math.cos(2 * t), 0.004 * math.sin(5 * t)]
+
+    def add(position: Sequence[float]) -> list[float]:
+        return [round(a + b, 5) for a, b in zip(position, sway, strict=True)]
+
+    def make_hand(x: float) -> dict[str, Any]:
+        thumb, pinch = [x, 1.15, -0.4], 0.008 if gesture else 0.07
+        wrist = [*add([x, 1.15, -0.3]), *(TURNED if gesture else LEVEL)]
+        joints = [0.12345] * 75  # as long as a page's
+        return {"wrist": wrist, "thumb": thumb, "index": [x, 1.15 + pinch, -0.4], "joints": joints}
+
+    head = [*add([0, 1.6, 0]), *LEVEL]
+    frame = {"type": "frame", "seq": number, "source": "hands", "t": time.monotonic() * 1e3}
+    return frame | {"head": head, "left": make_hand(-0.2), "right": make_hand(0.2)}
+
+
+def send_frames(port: int, seconds: float, rate: float) -> None:
+    """Be a page."""
+    from websockets.sync.client import connect
+
+    with connect(f"ws://localhost:{port}/ws?code={CODE}&role=operator", proxy=None) as ws:
+        begun = time.monotonic()
+        for number in range(round(seconds * rate)):
+            wait = begun + number / rate - time.monotonic()
+            while wait > 0:
+                try:
+                    values = json.loads(ws.recv(timeout=wait))
+                except TimeoutError:
+                    break
+                if values["type"] == "ping":
+                    pong = {"type": "pong", "id": values["id"], "t": time.monotonic() * 1e3}
+                    ws.send(json.dumps(pong))
+                wait = begun + number / rate - time.monotonic()
+            ws.send(json.dumps(make_message(number, time.monotonic() - begun)))
+
+
+class Delays:
+    """What is measured: all in seconds."""
+
+    def __init__(self) -> None:
+        self.sent: dict[float, float] = {}
+        """When each frame was sent, by its time."""
+        self.frame: list[float] = []
+        self.command: list[float] = []
+        self.told: list[float] = []
+        self.late_ticks = 0
+
+    def print(self) -> None:
+        """Print a row for each."""
+        for what, delays in (
+            ("send -> OperatorFrame", self.frame),
+            ("send -> command", self.command),
+            ("as the device tells it", self.told),
+        ):
+            if not delays:
+                print(f"  {what:24} none")
+                continue
+            p50, p99 = np.percentile(np.array(delays) * 1e3, [50, 99])
+            print(
+                f"  {what:24} n {len(delays):5}  p50 {p50:7.2f} ms  p99 {p99:7.2f} ms  "
+                f"max {max(delays) * 1e3:7.2f} ms"
+            )
+
+
+def add_device(delays: Delays) -> None:
+    """Register the device `measured`: a WebXR page whose frames are timed."""
+    from xop_lerobot.operator.devices import DEVICES
+    from xop_lerobot.operator.devices.webxr import WebXrDevice
+    from xop_lerobot.operator.frame import OperatorFrame
+
+    class Measured(WebXrDevice):
+        def receive(self, frame: OperatorFrame, source_time: float | None = None) -> None:
+            before = self._newest
+            super().receive(frame, source_time)
+            newest = self._newest
+            if newest is not None and newest is not before and source_time is not None:
+                delays.sent[newest.time] = source_time
+                delays.frame.append(time.monotonic() - source_time)
+
+    DEVICES.add("measured", Measured)
+
+
+def drive(settings: argparse.Namespace, delays: Delays) -> None:
+    """Let the page drive the robot in real time until it is gone."""
+    from xop_lerobot.link import RobotInfo
+    from xop_lerobot.low_level.policy import make_policy
+    from xop_lerobot.morphology.morphology import make_morphology
+    from xop_lerobot.operator.devices import DeviceConfig
+    from xop_lerobot.plant.config import SimulationConfig
+    from xop_lerobot.plant.policy_loop import PolicyLoop
+    from xop_lerobot.plant.simulation import Simulation
+    from xop_lerobot.retarget.config import RetargeterConfig
+    from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+
+    robot, low_level, fps = settings.robot, POLICIES[settings.robot], settings.fps
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    morphology = make_morphology(robot)
+    plant = Simulation(morphology, SimulationConfig(), kind="planning")
+    loop = PolicyLoop(morphology, plant, make_policy(low_level))
+    config = TeleoperationConfig(
+        device=DeviceConfig(type="measured", port=port, code=CODE, max_delay_s=5.0, stale_s=1.0),
+        retargeter=RetargeterConfig(type=settings.retargeter),
+    )
+    info = RobotInfo(f"xop_{robot}", morphology, low_level, None, "empty", fps, 0, realtime=True)
+    teleoperation = Teleoperation(config, info)
+    teleoperation.connect()
+    loop.reset(seed=0, settle_s=0.8)
+    device: Any = teleoperation.device
+    arguments = (port, settings.seconds, settings.rate)
+    page = multiprocessing.get_context("spawn").Process(target=send_frames, args=arguments)
+    page.start()
+    due = time.monotonic()
+    while page.is_alive():
+        action, record = teleoperation.step(loop.state)
+        now = time.monotonic()
+        if record.engaged and record.frame is not None and record.frame.time in delays.sent:
+            delays.command.append(now - delays.sent[record.frame.time])
+            delays.told.append(device.status.delay or 0.0)
+        loop.execute(action, 1 / fps)
+        due = max(due + 1 / fps, time.monotonic() - 1)
+        wait = due - time.monotonic()
+        delays.late_ticks += wait < 0
+        time.sleep(max(wait, 0))
+    page.join()
+    teleoperation.disconnect()
+    loop.close()
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robot", choices=list(POLICIES), default="g1")
+    parser.add_argument("--retargeter", choices=["direct", "mpc"], default="direct")
+    parser.add_argument("--fps", type=int, default=25, help="rate of the control loop [Hz]")
+    parser.add_argument("--rate", type=float, default=72.0, help="frames of the headset [Hz]")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    settings = parser.parse_args()
+    delays = Delays()
+    add_device(delays)
+    drive(settings, delays)
+    print(
+        f"{settings.robot}, {settings.retargeter}, loop at {settings.fps} Hz, frames at "
+        f"{settings.rate:g} Hz, {len(delays.command)} ticks engaged, {delays.late_ticks} ticks late, "
+        f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    )
+    delays.print()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""Send garbage to every port that is open, and print what it has done.
+
+    python scripts/fuzz_ports.py --bytes 10000000
+
+Everything stays on this machine. The process that is attacked is one of its own, so that a crash
+and the growth of its memory show; an operator, or a client, that behaves well goes on beside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
+PORTS = ("webxr", "webxr-tls", "control", "avp")
+
+
+def main() -> int:
+    """Run and print; return 1 if something was disturbed."""
+    import fuzzing
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--bytes", type=int, default=10_000_000, help="bytes for each port")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ports", nargs="+", choices=PORTS, default=PORTS)
+    settings = parser.parse_args()
+    runs = {
+        "webxr": lambda: fuzzing.fuzz_webxr(settings.bytes, settings.seed),
+        "webxr-tls": lambda: fuzzing.fuzz_webxr(settings.bytes, settings.seed, tls=True),
+        "control": lambda: fuzzing.fuzz_control(settings.bytes, settings.seed),
+        "avp": lambda: fuzzing.fuzz_avp(settings.bytes, settings.seed),
+    }
+    print(
+        "port         | bytes | connections | s | MB at 10 % | MB at the end | good: sent, taken |"
+    )
+    failed = False
+    for name in settings.ports:
+        r = runs[name]()
+        print(
+            f"{r.port:12} | {r.sent} | {r.connections} | {r.seconds:.0f} | {r.memory[0]:.1f} | "
+            f"{r.memory[1]:.1f} | {r.good[0]}, {r.good[1]} | longest gap {r.longest_gap:.2f} s",
+            flush=True,
+        )
+        for fault in r.find_faults():
+            failed = True
+            print(f"  FAULT {fault}")
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

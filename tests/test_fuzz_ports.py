@@ -1,0 +1,38 @@
+"""Garbage at every port that is open; `scripts/fuzz_ports.py` is the same with more of it."""
+
+from __future__ import annotations
+
+import random
+
+import fuzzing
+import pytest
+
+RUNS = {
+    "webxr": fuzzing.fuzz_webxr,
+    "webxr with TLS": lambda total: fuzzing.fuzz_webxr(total, tls=True),
+    "control": fuzzing.fuzz_control,
+    "avp": fuzzing.fuzz_avp,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(RUNS))
+def test_garbage_disturbs_nothing(name):
+    result = RUNS[name](200_000)
+    assert result.sent >= 200_000
+    assert result.find_faults(growth_mb=20.0) == []
+
+
+def test_faults_are_found():
+    result = fuzzing.Result("x", memory=(50.0, 70.0), left=(3, 0), good=(10, 9), errors=["boom"])
+    assert result.find_faults() == [
+        "logged: boom",
+        "memory grew from 50.0 to 70.0 MB",
+        "3 threads and 0 files are left",
+        "only 9 of 10 good messages were taken",
+    ]
+
+
+def test_garbage_is_the_same_for_a_seed():
+    made = [fuzzing.mutate(random.Random(3), b"0123456789") for _ in range(2)]
+    assert made[0] == made[1] != b"0123456789"
