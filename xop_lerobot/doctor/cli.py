@@ -1,0 +1,157 @@
+"""`xop-doctor`: checks whether this machine is ready, and says what to do where it is not.
+
+    xop-doctor                                        the machine alone
+    xop-doctor --device avp --host 192.168.1.40       and a Vision Pro, as it streams now
+    xop-doctor --device webxr --host 0.0.0.0          and any other headset, once it has the page
+
+Exit status: 0 if nothing fails, 1 if something does, 2 for a mistake in the command line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from xop_lerobot.command_line import CommandParser
+from xop_lerobot.doctor.certificate import check_certificate
+from xop_lerobot.doctor.cpu import check_cpu
+from xop_lerobot.doctor.disk import check_disk
+from xop_lerobot.doctor.finding import Finding, Level, Setup
+from xop_lerobot.doctor.gl import check_gl
+from xop_lerobot.doctor.headset import check_headset
+from xop_lerobot.doctor.interpreter import check_interpreter
+from xop_lerobot.doctor.plugin import check_plugin
+from xop_lerobot.doctor.ports import check_ports
+from xop_lerobot.errors import BadValue, UnknownName, XopError
+
+CHECKS: dict[str, Callable[[Setup], Finding]] = {
+    "interpreter": check_interpreter,
+    "gl": check_gl,
+    "plugin": check_plugin,
+    "disk": check_disk,
+    "ports": check_ports,
+    "certificate": check_certificate,
+    "headset": check_headset,
+    "cpu": check_cpu,
+}
+"""Checks by name, in their order."""
+DEVICES = ("avp", "webxr")
+
+
+def run_checks(setup: Setup, names: Sequence[str] = tuple(CHECKS)) -> Iterator[tuple[str, Finding]]:
+    """Run the checks `names` one after another; one that breaks down is a failure too."""
+    for name in names:
+        try:
+            yield name, CHECKS[name](setup)
+        except Exception as error:  # noqa: BLE001  whatever it is, the other checks go on
+            kind = "" if isinstance(error, XopError) else f"{type(error).__name__}: "
+            yield name, Finding(Level.FAIL, f"{kind}{error}")
+
+
+def make_parser() -> CommandParser:
+    """Make the parser of the command line."""
+    default = Setup()
+    parser = CommandParser("xop-doctor", __doc__)
+    add = parser.add_argument
+    add("--device", default="", help="headset: avp or webxr (default: none)")
+    add("--host", default="", help="avp: its address; webxr: address to listen at (default: "
+        "127.0.0.1)")  # fmt: skip
+    add("--port", type=int, default=0, help="its port (default: avp 12345, webxr 8012)")
+    add("--seconds", type=float, default=default.seconds,
+        help=f"for how long its stream is measured [s] (default: {default.seconds:g})")  # fmt: skip
+    add("--wait", type=float, default=default.wait,
+        help=f"for how long it is waited for [s] (default: {default.wait:g})")  # fmt: skip
+    add("--robot", default=default.robot, help="robot whose planner is timed (default: g1)")
+    add("--mode", default=default.mode, help="in which mode (default: stationary)")
+    add("--root", type=Path, default=None, help="where datasets go (default: LeRobot's folder)")
+    add(
+        "--only", default="", help=f"checks to run, with commas: {', '.join(CHECKS)} (default: all)"
+    )
+    add("--json", action="store_true", help="print one JSON object instead of lines")
+    return parser
+
+
+def parse_arguments(arguments: Sequence[str]) -> tuple[Setup, tuple[str, ...], bool]:
+    """Read the command line: what is wanted, the checks, and whether as JSON.
+
+    Raises:
+        BadValue: If a flag is malformed or out of its range.
+        UnknownName: If a flag, device, robot, mode or check is unknown, listing the known ones.
+    """
+    from xop_lerobot.command import Mode  # noqa: PLC0415
+    from xop_lerobot.morphology.morphology import make_morphology  # noqa: PLC0415
+
+    args = make_parser().parse(arguments)
+    if args.device and args.device not in DEVICES:
+        raise UnknownName("--device", args.device, DEVICES)
+    modes = [mode.name.lower() for mode in Mode]
+    if args.mode not in modes:
+        raise UnknownName("--mode", args.mode, modes)
+    make_morphology(args.robot)
+    for name in ("seconds", "wait"):
+        if not getattr(args, name) > 0:
+            raise BadValue(f"--{name} must be above 0, got {getattr(args, name):g}")
+    names = tuple(filter(None, (each.strip() for each in args.only.split(",")))) or tuple(CHECKS)
+    for name in names:
+        if name not in CHECKS:
+            raise UnknownName("check", name, CHECKS)
+    fields = {each.name for each in dataclasses.fields(Setup)}
+    values = {name: value for name, value in vars(args).items() if name in fields}
+    return Setup(**(values | {"root": args.root or find_root()})), names, args.json
+
+
+def find_root() -> Path:
+    """LeRobot's folder of datasets, as LeRobot itself finds it, without loading it."""
+    home = os.environ.get("HF_LEROBOT_HOME")
+    if home:
+        return Path(home).expanduser()
+    hugging = os.environ.get("HF_HOME")
+    base = Path(hugging).expanduser() if hugging else Path.home() / ".cache" / "huggingface"
+    return base / "lerobot"
+
+
+def print_finding(name: str, finding: Finding) -> None:
+    """Print what was found, and what to do."""
+    print(f"{finding.level.value.upper():<5} {name:<12} {finding.text}", flush=True)
+    if finding.advice:
+        print(f"{'':18} → {finding.advice}", flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `xop-doctor`; returns the exit status."""
+    try:
+        setup, names, as_json = parse_arguments(sys.argv[1:] if arguments is None else arguments)
+    except XopError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    findings = []
+    for name, finding in run_checks(setup, names):
+        findings.append((name, finding))
+        if not as_json:
+            print_finding(name, finding)
+    failed = sum(finding.level is Level.FAIL for _, finding in findings)
+    warned = sum(finding.level is Level.WARN for _, finding in findings)
+    if as_json:
+        checks = [
+            {
+                "check": name,
+                "level": finding.level.value,
+                "text": finding.text,
+                "advice": finding.advice,
+                "figures": dict(finding.figures),
+            }
+            for name, finding in findings
+        ]
+        print(json.dumps({"ok": not failed, "checks": checks}, indent=1))
+    else:
+        verdict = "not ready" if failed else "ready"
+        print(f"\n{verdict}: {failed} of {len(findings)} checks failed, {warned} with a drawback")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
