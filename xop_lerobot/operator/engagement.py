@@ -176,9 +176,16 @@ class Engagement:
         """
         self.alignment.engage(frame, poses, float(poses["head"][2]), self._robot_reach)
         self._was_engaged, self._was_refused = True, False
+        self._spend()
         self._begin(state, poses)
 
     def disengage(self) -> None:
         """Stop driving; the robot holds."""
         self.alignment.disengage()
+        self._spend()
         self._end()
+
+    def _spend(self) -> None:
+        """The gesture has had its effect: what is held of it from now on does nothing."""
+        if self.clutch is not None:
+            self.clutch.progress = 0.0

@@ -1,0 +1,117 @@
+"""What the operator is told: changes as they come into force, and what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+
+import numpy as np
+import pytest
+from test_teleoperation import Person, Rig, make_frame
+
+from xop_lerobot.command import Mode
+from xop_lerobot.operator.device import Device
+from xop_lerobot.operator.devices import DEVICES, DeviceConfig
+from xop_lerobot.operator.devices.live import LiveDevice
+from xop_lerobot.operator.display import Cue, NoticeBoard
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.telling import describe_settings, list_warnings, tell_changes
+from xop_lerobot.retarget.changes import Change
+from xop_lerobot.retarget.online import AppliedChange
+
+
+class Fake(Device):
+    trouble = ""
+
+    def read(self, time: float) -> OperatorFrame | None:
+        return None
+
+
+def warn(*, tracked=(1, 1, 1), engaged=True, plan_age=None, trouble="", device=None):
+    device = device or Fake()
+    device.trouble = trouble
+    frame = dataclasses.replace(make_frame(0.0, (0, 0, 1.6)), tracked=np.array(tracked, dtype=bool))
+    return list_warnings(device, frame, engaged=engaged, plan_age=plan_age)
+
+
+def test_nothing_is_wrong():
+    assert warn() == ()
+    assert warn(plan_age=0.2) == ()
+    assert list_warnings(Fake(), None, engaged=False, plan_age=None) == ()
+
+
+def test_hands_and_head_that_are_not_seen():
+    assert warn(tracked=(1, 0, 1)) == ("Your left hand is not seen: its arm stands still.",)
+    assert warn(tracked=(1, 1, 0), engaged=False) == ("Your right hand is not seen.",)
+    assert warn(tracked=(1, 0, 0)) == ("Your hands are not seen: the arms stand still.",)
+    assert warn(tracked=(0, 0, 0)) == ("The headset does not see where it is, or sends nothing.",)
+    # Where the device knows better, that is told.
+    assert warn(tracked=(0, 0, 0), trouble="it was taken off") == ("it was taken off",)
+
+
+def test_a_late_plan():
+    (late,) = warn(plan_age=0.52)
+    assert late == "The plan is 0.5 s old: this computer is too slow for the planner."
+
+
+def test_a_slow_stream():
+    class Slow(LiveDevice):
+        address, trouble = "nowhere", ""
+
+        def stream(self) -> None: ...
+        def interrupt(self) -> None: ...
+
+    device = Slow(DeviceConfig(), clock=lambda: now)
+    for i in range(12):
+        now = 1 + i / 12
+        device.receive(make_frame(now, (0.001 * i, 0, 1.6)))
+    assert warn(device=device) == ("Only 12 poses arrive in a second: gestures need 25.",)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (Change(mode=Mode.MOBILE), ""),
+        (Change(constraints={"upright": True}), "Constraint upright on"),
+        (Change(preset="conservative"), "Preset conservative"),
+        (
+            Change(weights={"position": 2.5}, preset="default"),
+            "Preset default; weight position 2.5",
+        ),
+        (Change(targets=("head",), body=()), "Targets head; body whole"),
+    ],
+)
+def test_changes_in_words(change, text):
+    assert describe_settings(change) == text
+
+
+def test_each_change_has_its_cue(caplog):
+    board = NoticeBoard()
+    both = Change(mode=Mode.MOBILE, constraints={"upright": False})
+    with caplog.at_level(logging.INFO):
+        tell_changes(board, [AppliedChange("gesture", both)])
+    assert [(n.cue, n.text) for n in board.notices] == [
+        (Cue.MODE, "Mode: mobile."),
+        (Cue.SETTING, "Constraint upright off."),
+    ]
+    assert "Mode: mobile." in caplog.text
+
+
+def test_a_toggle_is_told_when_it_holds():
+    """Through a teleoperation: what is asked for is told once it is in force."""
+    DEVICES.add("person", Person)
+    rig = Rig("rby1")
+    try:
+        rig.run(0.2)
+        rig.teleop.toggle("mode", "call")
+        assert rig.teleop.notice == ""
+        rig.run(0.1)
+        assert rig.teleop.notice == "Mode: mobile."
+        rig.teleop.change({"preset": "conservative"})
+        rig.run(0.1)
+        assert rig.teleop.notice == "Preset conservative."
+        rig.teleop.answer(Cue.REFUSED, "Nothing is recorded.")
+        assert rig.teleop.notice == "Nothing is recorded."
+    finally:
+        rig.close()
+        DEVICES.remove("person")
