@@ -74,10 +74,10 @@ class HandBlend:
         level = _level(goals["head"])
         for name, seen in zip(FRAMES[1:], tracked[1:], strict=True):
             if name in goals:
-                local = self._lead(
-                    time, name, pose_multiply(pose_inverse(level), goals[name]), seen
-                )
-                blended[name] = pose_multiply(level, local)
+                goal = pose_multiply(pose_inverse(level), goals[name])
+                local = self._lead(time, name, goal, seen)
+                if local is not goal:  # a goal that is followed stays as it is to the last bit
+                    blended[name] = pose_multiply(level, local)
                 self._last[name] = local
         return blended
 

@@ -32,7 +32,7 @@ from xop_lerobot.operator.simulated.hands import (
     tip_hands,
 )
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.operator.simulated.walking import compute_miss, find, glance, go_to, set_mode
+from xop_lerobot.operator.simulated.walking import compute_miss, find, go_to, set_mode
 from xop_lerobot.transforms import quat_conjugate, quat_rotate, quat_yaw, wrap_angle
 
 PRESS_MORE = 0.01
@@ -44,7 +44,9 @@ FARTHER = 0.055
 robot]."""
 APART = 0.12
 """So much farther apart than else the hands are when one walks up to a box [m]."""
-STAND_NEAR = 0.04
+RAISED = 0.25
+"""So much higher they are: a robot that turns beside a box sweeps with them over it [m]."""
+STAND_NEAR = 0.06
 """How far beside where it wants to stand before the box is good enough [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""
@@ -74,6 +76,8 @@ fast [rad/s]."""
 def carry_box(mind: Mind) -> Doing:
     """Take the box from its support to the spot on the table; who loses it takes it again."""
     yield from find(mind, "box")
+    # Nobody looks about with a box in the hands.
+    yield from find(mind, "spot")
     for attempt in range(APPROACHES):
         try:
             yield from walk_to_box(mind)
@@ -108,9 +112,9 @@ def walk_to_box(mind: Mind) -> Doing:
     miss, turn = compute_miss(mind, place)
     if miss > STAND_NEAR or abs(turn) > mind.person.heading_tolerance:
         yield from set_mode(mind, Mode.MOBILE)
-        yield from glance(mind, "spot")
         hands = relaxed_hands(mind.person.size)
         hands[:, 1] += [APART, -APART]
+        hands[:, 2] += mind.person.size * RAISED
         yield from go_to(mind, place, hands=hands, tolerance=STAND_NEAR)
     yield from set_mode(mind, Mode.STATIONARY)
 
