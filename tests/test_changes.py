@@ -389,15 +389,21 @@ def test_both_hands_are_one_gesture(lag):
     assert gesture is Gesture.BOTH_DOUBLE_PINCH
 
 
-@pytest.mark.parametrize("right", [(0.6,), (1.7, 2.02), (0.5, 0.82, 1.14)])
+@pytest.mark.parametrize("right", [(0.6,), (0.5, 0.82, 1.14)])
 def test_another_thing_of_the_other_hand_leaves_the_toggle(right):
-    """A grasp with one pinch, a double pinch much later, three pinches."""
+    """A grasp with one pinch, three pinches."""
     gestures = [gesture for _, gesture in read(pinches(PAIR, right))]
     assert gestures == [Gesture.DOUBLE_PINCH]
 
 
-def test_the_other_hand_alone_does_nothing():
-    assert read(pinches((), PAIR)) == []
+def test_double_pinches_of_the_hands_far_apart_in_time_are_two_gestures():
+    gestures = [gesture for _, gesture in read(pinches(PAIR, (1.7, 2.02)))]
+    assert gestures == [Gesture.DOUBLE_PINCH, Gesture.OTHER_DOUBLE_PINCH]
+
+
+def test_the_other_hand_alone_has_a_gesture_of_its_own():
+    ((_, gesture),) = read(pinches((), PAIR))
+    assert gesture is Gesture.OTHER_DOUBLE_PINCH
     ((_, gesture),) = read(pinches((), PAIR), double_pinch=DoublePinchConfig(hand="right"))
     assert gesture is Gesture.DOUBLE_PINCH
 
