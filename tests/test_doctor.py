@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
+import re
 import socket
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from avp_server import AvpServer
+from websockets.exceptions import ConnectionClosed
+from webxr_client import Page
 
 from xop_lerobot.doctor import cli, cpu, disk, interpreter, plugin
 from xop_lerobot.doctor.certificate import check_certificate
@@ -23,6 +29,7 @@ from xop_lerobot.doctor.headset import check_headset
 from xop_lerobot.doctor.interpreter import check_interpreter, find_faults
 from xop_lerobot.doctor.plugin import check_plugin
 from xop_lerobot.doctor.ports import check_ports
+from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.certificate import get_certificate
 from xop_lerobot.transforms import make_pose, quat_exp
@@ -212,6 +219,38 @@ def test_nobody_streams():
     assert "nobody answers" in found.text
     assert time.monotonic() - begun < 60
     assert check_headset(Setup()).level is Level.SKIP
+
+
+def test_a_page_that_streams(capsys):
+    """Its address is printed, and goes beside the object where JSON is asked for."""
+    port, findings, printed = find_port(), [], ""
+    flags = ["--device=webxr", f"--port={port}", "--only=headset", "--seconds=1", "--json"]
+    checking = threading.Thread(target=lambda: findings.append(cli.main([*flags, "--wait=60"])))
+    checking.start()
+    while "code=" not in printed:
+        assert checking.is_alive()
+        printed += capsys.readouterr().err
+        time.sleep(0.01)
+    code = re.findall(r"code=(\w+)", printed)[0]
+    door = SimpleNamespace(url=f"http://localhost:{port}/", certificate=None)
+    page = Page(cast("WebXrDevice", door), code=code)
+    page.wait_for("ping")
+    with contextlib.suppress(ConnectionClosed):  # the check is over
+        for i in range(4000):
+            sway = 0.001 * np.sin(i / 5)
+            hand = {"wrist": [0.2 + sway, 1.1, -0.3, 0, 0, 0, 1], "pinch": 0.05}
+            page.send(
+                {
+                    "type": "frame", "seq": i, "t": page.clock() * 1e3, "source": "standin",
+                    "head": [sway, 1.6, 0, 0, 0, 0, 1], "left": hand, "right": hand,
+                }
+            )  # fmt: skip
+            time.sleep(0.01)
+    checking.join()
+    (check,) = json.loads(capsys.readouterr().out)["checks"]
+    assert check["figures"]["rate_hz"] > 1
+    assert check["figures"]["delay_ms"] >= 0
+    assert f"WebXR page at http://localhost:{port}/" in check["text"]
 
 
 # -- the planner, and the command ----------------------------------------------------------

@@ -9,6 +9,7 @@ Exit status: 0 if nothing fails, 1 if something does, 2 for a mistake in the com
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -129,10 +130,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     findings = []
-    for name, finding in run_checks(setup, names):
-        findings.append((name, finding))
-        if not as_json:
-            print_finding(name, finding)
+    # A headset's page prints its address, which is no part of the object.
+    with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+        for name, finding in run_checks(setup, names):
+            findings.append((name, finding))
+            if not as_json:
+                print_finding(name, finding)
     failed = sum(finding.level is Level.FAIL for _, finding in findings)
     warned = sum(finding.level is Level.WARN for _, finding in findings)
     if as_json:
