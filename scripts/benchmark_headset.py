@@ -175,8 +175,8 @@ def main() -> None:
     drive(settings, delays)
     print(
         f"{settings.robot}, {settings.retargeter}, loop at {settings.fps} Hz, frames at "
-        f"{settings.rate:g} Hz, {len(delays.command)} ticks engaged, {delays.late_ticks} ticks late, "
-        f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+        f"{settings.rate:g} Hz, {len(delays.command)} ticks engaged, "
+        f"{delays.late_ticks} ticks late, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
     )
     delays.print()
 

@@ -8,6 +8,7 @@ run, `test_fuzz_ports.py` a short one.
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import json
 import logging
@@ -49,9 +50,11 @@ class Result:
         connections: Over how many connections.
         seconds: For how long.
         memory: Resident memory of the process after a tenth of the bytes, and at the end [MB].
+        objects: Python's own objects, likewise.
         left: Threads and open files more than before.
         good: Messages of the stream that goes on beside: sent, and taken.
-        longest_gap: Longest time between two that were taken [s].
+        counts: What became of all frames meanwhile.
+        longest_gap: Longest time between two that were taken, and the same without garbage [s].
         errors: What was logged as an error.
     """
 
@@ -60,9 +63,11 @@ class Result:
     connections: int = 0
     seconds: float = 0.0
     memory: tuple[float, float] = (0.0, 0.0)
+    objects: tuple[int, int] = (0, 0)
     left: tuple[int, int] = (0, 0)
     good: tuple[int, int] = (0, 0)
-    longest_gap: float = 0.0
+    counts: dict[str, int] = field(default_factory=dict)
+    longest_gap: tuple[float, float] = (0.0, 0.0)
     errors: list[str] = field(default_factory=list)
 
     def find_faults(self, growth_mb: float = 8.0) -> list[str]:
@@ -70,10 +75,14 @@ class Result:
         faults = [f"logged: {error}" for error in self.errors[:3]]
         if self.memory[1] - self.memory[0] > growth_mb:
             faults.append(f"memory grew from {self.memory[0]:.1f} to {self.memory[1]:.1f} MB")
+        if self.objects[1] > self.objects[0] + 5_000:
+            faults.append(f"objects grew from {self.objects[0]} to {self.objects[1]}")
         if self.left[0] > 2 or self.left[1] > 4:
             faults.append(f"{self.left[0]} threads and {self.left[1]} files are left")
         if self.good[1] < self.good[0]:
-            faults.append(f"only {self.good[1]} of {self.good[0]} good messages were taken")
+            faults.append(
+                f"only {self.good[1]} of {self.good[0]} good messages were taken: {self.counts}"
+            )
         return faults
 
 
@@ -90,41 +99,57 @@ class _Errors(logging.Handler):
         self.seen.append(f"{record.name}: {record.getMessage()[:200]} {error!r:.200}")
 
 
-def _make_device(config: dict[str, Any]) -> tuple[Callable[[], dict[str, Any]], Callable[[], None]]:
-    from xop_lerobot.operator.devices import DeviceConfig, live, make_device
-    from xop_lerobot.operator.display import Display
+class _Driver:
+    """A control loop that reads a device, and shows something on it."""
 
-    live.RETRY_S = 0.02
-    device: Any = make_device(DeviceConfig(**config))
-    device.connect()
-    picture = np.zeros((240, 320, 3), dtype=np.uint8)
-    last, gap, heard = None, 0.0, time.monotonic()
+    def __init__(self, config: dict[str, Any]) -> None:
+        from xop_lerobot.operator.devices import DeviceConfig, live, make_device
 
-    def step() -> dict[str, Any]:
-        nonlocal last, gap, heard
-        frame = device.read(0.0)
+        live.RETRY_S = 0.02
+        self._device: Any = make_device(DeviceConfig(**config))
+        self._device.connect()
+        self._picture = np.zeros((240, 320, 3), dtype=np.uint8)
+        self._last, self._heard, self._gap = None, 0.0, 0.0
+
+    def step(self) -> None:
+        from xop_lerobot.operator.display import Display
+
+        frame = self._device.read(0.0)
         if frame is not None and frame.tracked[0]:
-            assert np.isfinite(np.concatenate([frame.head, frame.left_wrist, frame.pinch])).all()
-            if frame.time != last:
+            poses = np.concatenate([frame.head, frame.left_wrist, frame.pinch])
+            assert np.isfinite(poses).all()
+            if frame.time != self._last:
                 now = time.monotonic()
-                gap = max(gap, now - heard) if last is not None else 0.0
-                last, heard = frame.time, now
-        device.take_wishes()
-        device.show(Display(time.monotonic(), pictures={"head": picture}))
-        return {"taken": device.status.counts.get("taken", 0), "gap": gap}
+                if self._last is not None:
+                    self._gap = max(self._gap, now - self._heard)
+                self._last, self._heard = frame.time, now
+        self._device.take_wishes()
+        self._device.show(Display(time.monotonic(), pictures={"head": self._picture}))
 
-    return step, device.disconnect
+    def report(self) -> dict[str, Any]:
+        """How many frames were taken, and the longest gap between two since the last report."""
+        gap, self._gap = self._gap, 0.0
+        counts = self._device.status.counts
+        return {"taken": counts.get("taken", 0), "gap": gap, "counts": counts}
+
+    def close(self) -> None:
+        self._device.disconnect()
 
 
-def _make_control(
-    config: dict[str, Any],
-) -> tuple[Callable[[], dict[str, Any]], Callable[[], None]]:
-    from test_control import Session
+class _Control:
+    def __init__(self, config: dict[str, Any]) -> None:
+        from test_control import Session
 
-    from xop_lerobot.control.server import ControlServer
+        from xop_lerobot.control.server import ControlServer
 
-    server = ControlServer(Path(config["path"]), Session())
-    return lambda: {"taken": 0, "gap": 0.0}, server.close
+        self._server = ControlServer(Path(config["path"]), Session())
+        self.close = self._server.close
+
+    def step(self) -> None:
+        pass
+
+    def report(self) -> dict[str, Any]:
+        return {}
 
 
 def _attend(pipe: Any, kind: str, config: dict[str, Any]) -> None:
@@ -132,27 +157,25 @@ def _attend(pipe: Any, kind: str, config: dict[str, Any]) -> None:
     logging.getLogger().addHandler(errors)
     process = psutil.Process()
     sys.stdout = io.StringIO()  # the invitation
-    make = _make_control if kind == "control" else _make_device
-    step, close = make(config)
+    subject = _Control(config) if kind == "control" else _Driver(config)
     pipe.send("ready")
     while True:
         pipe.poll(0.02)
-        status = step()
+        subject.step()
         while pipe.poll():
             if pipe.recv() == "stop":
-                close()
+                subject.close()
                 pipe.send("stopped")
                 return
-            memory = process.memory_info().rss / 1e6
-            pipe.send(
-                {
-                    **status,
-                    "memory": memory,
-                    "threads": process.num_threads(),
-                    "files": process.num_fds(),
-                    "errors": errors.seen[:20],
-                }
-            )
+            gc.collect()
+            counts = {
+                "objects": len(gc.get_objects()),
+                "memory": process.memory_info().rss / 1e6,
+                "threads": process.num_threads(),
+                "files": process.num_fds(),
+                "errors": errors.seen[:20],
+            }
+            pipe.send(subject.report() | counts)
 
 
 class Subject:
@@ -276,14 +299,18 @@ class Attack:
             result.connections += 1
             if warm is None and result.sent >= self._total / 10:
                 warm = subject.ask()
-        end = self._settle(start)
         result.seconds += time.monotonic() - begun
-        result.memory = (warm or start)["memory"], end["memory"]
+        end = self._settle(start)
+        warm = warm or start
+        result.memory = warm["memory"], end["memory"]
+        result.objects = warm["objects"], end["objects"]
+        result.longest_gap = max(end.get("gap", 0.0), warm.get("gap", 0.0)), 0.0
         result.left = end["threads"] - start["threads"], end["files"] - start["files"]
         result.errors = end["errors"]
 
     def _settle(self, start: dict[str, Any]) -> dict[str, Any]:
-        """Wait until the last connections are gone."""
+        """Wait until the last connections are gone, and forgotten."""
+        time.sleep(4.5)
         deadline = time.monotonic() + 30
         while True:
             end = self._subject.ask()
@@ -368,15 +395,19 @@ def fuzz_webxr(total: int, seed: int = 0, tls: bool = False) -> Result:
         lambda i: page.send(encode(make_person(time.monotonic(), False), i, page.clock()))
     )
     time.sleep(0.5)
+    subject.ask()
+    time.sleep(min(total / 1e6, 10))
+    quiet = subject.ask()["gap"]
     Attack(result, total * 3 // 4, subject).run([send_raw, send_http, send_frames, send_json])
     good.stop()
     time.sleep(0.5)
     status = subject.ask()
-    result.good, result.longest_gap = (good.sent, status["taken"]), status["gap"]
+    result.good, result.counts = (good.sent, status["taken"]), status["counts"]
+    result.longest_gap = max(result.longest_gap[0], status["gap"]), quiet
     page.close()
-    memory = result.memory[0]
+    memory, gaps = result.memory[0], result.longest_gap
     Attack(result, total, subject).run([send_json, send_frames])  # now there is room to drive
-    result.memory = memory, result.memory[1]
+    result.memory, result.longest_gap = (memory, result.memory[1]), gaps
     subject.stop()
     return result
 
@@ -434,7 +465,7 @@ def fuzz_control(total: int, seed: int = 0) -> Result:
                     pass
             return len(data)
 
-        answered = []
+        answered: list[float] = []
         asker = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         asker.settimeout(60)
         asker.connect(str(path))
@@ -447,10 +478,13 @@ def fuzz_control(total: int, seed: int = 0) -> Result:
                 answered.append(time.monotonic() - begun)
 
         good = GoodStream(ask)
+        time.sleep(min(total / 1e6, 10) + 0.2)
+        quiet = max(answered)
+        answered_before = len(answered)
         Attack(result, total, subject).run([send])
         good.stop()
         result.good = good.sent, len(answered)
-        result.longest_gap = max(answered, default=0.0)
+        result.longest_gap = max(answered[answered_before:], default=0.0), quiet
         lines.close()
         asker.close()
         subject.stop()
@@ -481,7 +515,7 @@ def fuzz_avp(total: int, seed: int = 0) -> Result:
 
     start = subject.ask()
     Attack(result, total * 9 // 10, subject).run([send_messages])
-    memory, result.longest_gap = result.memory[0], subject.ask()["gap"]
+    memory, gaps = result.memory[0], result.longest_gap
     server.close()
 
     with socket.create_server(("127.0.0.1", port)) as listener:
@@ -505,7 +539,7 @@ def fuzz_avp(total: int, seed: int = 0) -> Result:
         again.send(make_person(time.monotonic(), False))
         time.sleep(0.02)
     result.good = 5, min(status["taken"] - before, 5)
-    result.memory = memory, result.memory[1]
+    result.memory, result.longest_gap = (memory, result.memory[1]), gaps
     result.left = status["threads"] - start["threads"], status["files"] - start["files"]
     subject.stop()
     again.close()

@@ -24,12 +24,13 @@ def test_garbage_disturbs_nothing(name):
 
 
 def test_faults_are_found():
-    result = fuzzing.Result("x", memory=(50.0, 70.0), left=(3, 0), good=(10, 9), errors=["boom"])
+    result = fuzzing.Result("x", memory=(50.0, 70.0), left=(3, 0), good=(10, 9))
+    result.counts, result.errors = {"late": 1}, ["boom"]
     assert result.find_faults() == [
         "logged: boom",
         "memory grew from 50.0 to 70.0 MB",
         "3 threads and 0 files are left",
-        "only 9 of 10 good messages were taken",
+        "only 9 of 10 good messages were taken: {'late': 1}",
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Awaitable, Callable
 
 from aiohttp import web
@@ -17,43 +18,56 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 class Connections:
     """Lets connections in, and ends those that hold a place for nothing.
 
+    Only those that are there, or may still arrive, are remembered: however many come and go, it
+    is never more than `MAX_CONNECTIONS` of each.
+
     Args:
         arrival_s: How long a connection may take until it can be used, as for TLS [s].
     """
 
     def __init__(self, arrival_s: float) -> None:
         self._arrival_s = arrival_s
-        self._silent: dict[asyncio.Protocol, asyncio.TimerHandle] = {}
+        self._arrivals: deque[tuple[float, asyncio.Protocol]] = deque()
+        self._silent: dict[asyncio.BaseProtocol, float] = {}
+        self._asked: set[asyncio.BaseProtocol] = set()
 
     def let_in(self, server: web.Server | None) -> asyncio.Protocol:
         """Make the protocol of a new connection."""
-        if server is None or self._count(server) >= MAX_CONNECTIONS:
+        now = asyncio.get_running_loop().time()
+        self._forget(now)
+        if server is None:
+            return _Refusal()
+        there = set(server.connections)
+        arriving = sum(handler not in there for _, handler in self._arrivals)
+        if len(there) + arriving >= MAX_CONNECTIONS or len(self._arrivals) >= MAX_CONNECTIONS:
             return _Refusal()
         handler = server()
-        loop = asyncio.get_running_loop()
-        self._silent[handler] = loop.call_later(FIRST_REQUEST_S, self._end, handler)
+        self._arrivals.append((now, handler))
         return handler
 
-    def _count(self, server: web.Server) -> int:
-        """Connections that are there, and those that arrive."""
-        there = set(server.connections)
-        begun = asyncio.get_running_loop().time() + FIRST_REQUEST_S - self._arrival_s
-        arriving = (
-            timer.when() >= begun for each, timer in self._silent.items() if each not in there
-        )
-        return len(there) + sum(arriving)
+    def _forget(self, now: float) -> None:
+        while self._arrivals and self._arrivals[0][0] <= now - self._arrival_s:
+            self._arrivals.popleft()
 
-    def _end(self, handler: web.RequestHandler) -> None:
-        del self._silent[handler]
-        if handler.transport is not None:
-            handler.transport.abort()
+    async def watch(self, server: web.Server) -> None:
+        """End connections over which nothing is asked, until this is cancelled."""
+        while True:
+            await asyncio.sleep(min(1.0, FIRST_REQUEST_S))
+            now = asyncio.get_running_loop().time()
+            self._forget(now)
+            there = server.connections
+            self._asked.intersection_update(there)
+            silent = [handler for handler in there if handler not in self._asked]
+            self._silent = {handler: self._silent.get(handler, now) for handler in silent}
+            for handler in silent:
+                late = now - self._silent[handler] >= FIRST_REQUEST_S
+                if late and handler.transport is not None:
+                    handler.transport.abort()
 
     @web.middleware
     async def note_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Take note that something is asked over a connection."""
-        timer = self._silent.pop(request.protocol, None)
-        if timer is not None:
-            timer.cancel()
+        self._asked.add(request.protocol)
         return await handler(request)
 
 

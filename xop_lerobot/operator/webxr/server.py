@@ -38,7 +38,7 @@ HEARTBEAT_S = 3.0
 """Clients that answer nothing for so long are let go [s]."""
 CLOSE_S = 2.0
 """How long a farewell may take [s]."""
-HANDSHAKE_S = 5.0
+HANDSHAKE_S = 3.0
 """How long TLS may take [s]."""
 ARRIVAL_S = 0.5
 """How long a connection without TLS may take to be there [s]."""
@@ -139,6 +139,7 @@ class HeadsetServer:
             shutdown_timeout=CLOSE_S,
         )
         await runner.setup()
+        watch: asyncio.Task[None] | None = None
         try:
             tls = None if self._certificate is None else self._certificate.make_context()
             self._port = await asyncio.get_running_loop().create_server(
@@ -147,12 +148,16 @@ class HeadsetServer:
                 ssl=tls,
                 ssl_handshake_timeout=HANDSHAKE_S if tls else None,
             )
+            if runner.server is not None:
+                watch = asyncio.create_task(self._connections.watch(runner.server))
             await stop.wait()
         finally:
             if self._port is not None:
                 self._port.close()
-            for client in list(self._clients):
-                await self._dismiss(client, "the session has ended")
+            if watch is not None:
+                watch.cancel()
+            farewells = [self._dismiss(each, "the session has ended") for each in self._clients]
+            await asyncio.gather(*farewells)
             await runner.cleanup()
 
     async def _send_page(self, request: web.Request) -> web.StreamResponse:
@@ -181,7 +186,10 @@ class HeadsetServer:
         ws = web.WebSocketResponse(
             max_msg_size=2 * MAX_MESSAGE, compress=False, heartbeat=HEARTBEAT_S, timeout=CLOSE_S
         )
-        await ws.prepare(request)
+        try:
+            await ws.prepare(request)
+        except ValueError:  # headers that are no text
+            raise web.HTTPBadRequest from None
         client = Client(ws, request, role, self._wearer.clock)
         reason = self._door.refuse(address, request.query.get("code", ""), self._wearer.clock())
         if reason is not None:
