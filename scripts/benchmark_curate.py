@@ -27,6 +27,7 @@ COMMANDS = {
     "inspect": ["inspect", "--json", "{work}/figures.json"],
     "filter --dry-run": ["filter", "--where", WHERE, "--dry-run"],
     "filter": ["filter", "--where", WHERE, "--out", "{work}/filtered"],
+    "report": ["report", "--out", "{work}/report.html"],
 }
 
 
@@ -57,7 +58,7 @@ def measure(command: list[str]) -> dict[str, Any]:
         "wall_s": round(wall, 2),
         "cpu_s": round(usage.ru_utime + usage.ru_stime, 2),
         "peak_mb": round(usage.ru_maxrss / 1024, 1),
-        "last_line": text.strip().splitlines()[0 if "filter" in command else -1],
+        "last_line": text.strip().splitlines()[-1 if "inspect" in command else 0],
     }
 
 
@@ -67,6 +68,7 @@ def main() -> None:
     parser.add_argument("--episodes", default="10,100,1000", help="numbers of episodes")
     parser.add_argument("--frames", type=int, default=9000, help="frames of an episode")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--verbs", default="", help="only these, such as report (default: all)")
     parser.add_argument("--work", type=Path, help="directory for the datasets (default: a new one)")
     parser.add_argument("--json", type=Path, help="file for the figures (default: none)")
     settings = parser.parse_args()
@@ -86,6 +88,8 @@ def main() -> None:
                 raise SystemExit("the dataset could not be made")
             size = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
             for name, words in COMMANDS.items():
+                if settings.verbs and name not in settings.verbs.split(","):
+                    continue
                 command = [word.format(work=work) for word in words]
                 figures = measure([command[0], "--root", str(work / "data"), *command[1:]])
                 hours = count * settings.frames / 25 / 3600

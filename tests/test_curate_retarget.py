@@ -291,7 +291,7 @@ def test_episodes_that_cannot_be_replayed_are_left_out(source, tmp_path, capsys)
     assert plan[1:] == [
         "episode 1: 2.8 s of 'sway'",
         plan[2],
-        "1 episodes, 2.8 s would be replayed",
+        "1 episode, 2.8 s would be replayed",
     ]
     assert "file-002.parquet is not readable" in plan[2]
     assert retarget(root, out, "--workers=1") == 0
@@ -301,7 +301,7 @@ def test_episodes_that_cannot_be_replayed_are_left_out(source, tmp_path, capsys)
     # Once the source is mended, the same command adds what was left out.
     shutil.copy(source / "data/chunk-000/file-002.parquet", root / "data/chunk-000")
     assert retarget(root, out, "--workers=1") == 0
-    assert "1 episodes are there already" in capsys.readouterr().err
+    assert "1 episode is there already" in capsys.readouterr().err
     origins = [facts["provenance"][-1]["source_episode"] for facts in read_facts(out)]
     assert origins == [1, 2]
 
@@ -407,7 +407,7 @@ def test_stopped_runs_go_on(made, source, tmp_path, capsys, monkeypatch):
         "stopped; the same command goes on with the finished episodes"
     )
     assert retarget(source, out, "--workers=1") == 0
-    assert "1 episodes are there already" in capsys.readouterr().err
+    assert "1 episode is there already" in capsys.readouterr().err
     attempts = json.loads((out / "meta/xop/retarget.json").read_text())["attempts"]
     assert attempts[0] == written
     assert not RetargetFolder(out).work.exists()

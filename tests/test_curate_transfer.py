@@ -394,7 +394,7 @@ def test_split(recorded, tmp_path, capsys):
     )
     assert code == 0
     assert capsys.readouterr().out == (
-        f"train: 2 episodes (0, 2)\nval: 1 episodes (1)\nwritten to {out.resolve()}\n"
+        f"train: 2 episodes (0, 2)\nval: 1 episode (1)\nwritten to {out.resolve()}\n"
     )
     check_same(recorded, out / "train", [(0, None), (2, None)], 25, HEAD)
     check_same(recorded, out / "val", [(1, None)], 25, HEAD)
@@ -404,7 +404,7 @@ def test_split(recorded, tmp_path, capsys):
 def test_split_by_fractions(recorded, tmp_path, capsys):
     words = ["split", "--root", str(recorded), "--dry-run", "--parts", "a=0.67", "b=0.33"]
     assert main(words) == 0
-    assert capsys.readouterr().out == "a: 2 episodes (0:2)\nb: 1 episodes (2)\n"
+    assert capsys.readouterr().out == "a: 2 episodes (0:2)\nb: 1 episode (2)\n"
     assert main([*words, "--shuffle", "1"]) == 0
     shuffled = capsys.readouterr().out
     assert main([*words, "--shuffle", "1"]) == 0

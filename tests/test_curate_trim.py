@@ -83,7 +83,7 @@ def test_idle_ends_are_cut(base, tmp_path, capsys):
     start, stop = spans[0]
     assert text.startswith(
         f"episode 0: 4.80 s, {start / FPS:.2f} s cut off the start, {(120 - stop) / FPS:.2f} s "
-        f"off the end\n1 episodes cut, "
+        f"off the end\n1 episode cut, "
     )
 
 

@@ -102,7 +102,7 @@ def make_parser() -> CommandParser:
     add(
         "--task",
         required=True,
-        help="dual_point_touch, box_pick_and_place or non_prehensile_transport",
+        help="dual_point_touch, dual_point_reach, box_pick_and_place or non_prehensile_transport",
     )
     add("--episodes", required=True, type=int, help="how many episodes there shall be")
     add("--root", required=True, type=Path, help="directory of the dataset")

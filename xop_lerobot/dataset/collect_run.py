@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from xop_lerobot.dataset.collect_folder import Attempt, CollectFolder
 from xop_lerobot.dataset.collect_jobs import make_attempts
+from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.collect_config import CollectConfig
@@ -67,7 +68,8 @@ def run_collection(
         made = make_attempts(config, folder, make_jobs(missing), workers, begin, ray)
         with _Progress(config, len(missing), quiet=quiet) as progress, closing(made):
             if done:
-                progress.say(f"{len(done)} episodes are there already")
+                are = "is" if len(done) == 1 else "are"
+                progress.say(f"{say_count(len(done), 'episode')} {are} there already")
             for attempt in made:
                 done[attempt.index] = attempt
                 progress.note(attempt)

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from xop_lerobot.dataset.facts import EPISODES_FILE, FACTS_PREFIX
 from xop_lerobot.errors import BadDataset
+from xop_lerobot.wording import say_count
 
 UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError)
 """What reading a malformed parquet file may raise."""
@@ -137,7 +138,7 @@ _REPAIR = "`xop-curate repair` restores a recording that was cut off"
 
 
 def _count(info: Mapping[str, Any]) -> str:
-    return f"meta/info.json counts {info['total_episodes']} episodes"
+    return f"meta/info.json counts {say_count(info['total_episodes'], 'episode')}"
 
 
 def _fault(root: Path, note: Callable[[str], None] | None, text: str) -> None:

@@ -27,6 +27,7 @@ from xop_lerobot.dataset.curate.expression import UnknownFigure
 from xop_lerobot.dataset.curate.figures import FIGURES, KINDS, describe_figures
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.errors import BadValue
+from xop_lerobot.wording import say_count
 
 SUMMARY = "show what is in a dataset: tracking, smoothness, falls, gaps, idle time, …"
 
@@ -85,7 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
             for problem in finding.problems:
                 tqdm.write(f"problem: {problem}", file=sys.stderr)
         if not faults and totals.episodes != total:
-            faults.append(f"meta/info.json counts {total} episodes, there are {totals.episodes}")
+            counted = say_count(total, "episode")
+            faults.append(f"meta/info.json counts {counted}, there are {totals.episodes}")
     for fault in faults:
         print(f"problem: {fault}", file=sys.stderr)
     if not to_output:

@@ -47,6 +47,7 @@ from xop_lerobot.dataset.curate.labels import (
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.dataset.curate.subtasks import SUBTASK, write_subtasks
 from xop_lerobot.errors import BadValue
+from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip
@@ -169,7 +170,7 @@ class Labeller:
         if strange:
             raise BadValue(
                 f"there are labels of episode {min(strange)}, but '{source.root}' has "
-                f"{source.total_episodes} episodes"
+                f"{say_count(source.total_episodes, 'episode')}"
             )
         self.names = list(rules.names) if rules else []
         marked = [name for each in self._labels.values() for name, _ in each.subtasks]

@@ -25,6 +25,7 @@ from xop_lerobot.dataset.curate.arguments import (
 )
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.errors import BadDataset, BadValue
+from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip
@@ -51,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         destination = make_destination(arguments, *roots)
         if destination is None:
             for source in sources:
-                print(f"{source.root}: {sum(1 for _ in source.episodes)} episodes")
+                print(f"{source.root}: {say_count(sum(1 for _ in source.episodes), 'episode')}")
             return 0
         from xop_lerobot.dataset.curate.transfer import Step, transfer  # noqa: PLC0415 torch
 
@@ -60,7 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
             clips = _make_clips(sources, quiet=arguments.quiet)
             done = transfer(clips, draft, Step.now("merge"), features)
     print(
-        f"{done.episodes} episodes, {done.frames} frames of {len(roots)} datasets, "
+        f"{say_count(done.episodes, 'episode')}, {say_count(done.frames, 'frame')} of "
+        f"{say_count(len(roots), 'dataset')}, "
         f"written to {destination.root}"
     )
     return 0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import av
 import numpy as np
 from av.error import FFmpegError
 
+from xop_lerobot.dataset.curate.packets import find_framing
 from xop_lerobot.errors import BadDataset
 
 
@@ -30,11 +31,13 @@ class VideoIndex:
         pts: When each is shown, in units of `time_base`. Shape (n,).
         keys: Whether each is a key frame. Shape (n,), bool.
         time_base: Unit of the times [s].
+        damaged: Which of them are damaged, as far as their framing tells. Shape (m,).
     """
 
     pts: np.ndarray
     keys: np.ndarray
     time_base: Fraction
+    damaged: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def times(self) -> np.ndarray:
@@ -48,6 +51,18 @@ class VideoIndex:
         after = np.searchsorted(times, wanted)
         near = np.minimum(wanted - times[after - 1], times[after] - wanted)
         return int((near > 0.25 / fps).sum())
+
+    def count_damaged(self, start: float, stop: float, fps: float) -> int:
+        """Count the pictures from `start` to `stop` [s] that are damaged, or are made from such.
+
+        What comes after a damaged picture is made from it, until the next key frame.
+        """
+        spoiled = np.zeros(len(self.pts), bool)
+        keys = np.append(np.flatnonzero(self.keys), len(self.pts))
+        for packet in self.damaged:
+            spoiled[packet : keys[np.searchsorted(keys, packet, side="right")]] = True
+        half, times = 0.5 / fps, self.times
+        return int((spoiled & (times > start - half) & (times < stop - half)).sum())
 
     def find_groups(self, start: float, stop: float, fps: float) -> tuple[int, int] | None:
         """Find the whole groups that hold what is shown from `start` to `stop` [s].
@@ -67,22 +82,26 @@ class VideoIndex:
 
 
 def index_video(root: Path, file: Path) -> VideoIndex:
-    """Index the pictures of `root / file` without decoding them.
+    """Index the pictures of `root / file` without decoding them, and look at their framing.
 
     Raises:
         BadDataset: If there is no such file, or it is no video.
     """
-    pts, keys, time_base = [], [], Fraction(1, 1)
+    pts, keys, damaged, time_base = [], [], [], Fraction(1, 1)
     try:
         size = (root / file).stat().st_size
         with av.open(str(root / file)) as container:
             stream = container.streams.video[0]
+            codec = stream.codec_context
+            is_whole = find_framing(codec.codec.canonical_name, codec.extradata)
             for packet in container.demux(stream):
                 if packet.pts is None or packet.dts is None:
                     continue
                 # The file may be cut off in it, which the decoder's library does not always tell.
                 if packet.is_corrupt or (packet.pos or 0) + packet.size > size:
                     break
+                if is_whole is not None and not is_whole(bytes(packet)):
+                    damaged.append(len(pts))
                 pts.append(packet.pts)
                 keys.append(packet.is_keyframe)
             time_base = stream.time_base or Fraction(1, 1)
@@ -90,7 +109,8 @@ def index_video(root: Path, file: Path) -> VideoIndex:
         raise BadDataset(root, f"{file} is missing") from None
     except (FFmpegError, OSError, IndexError, ValueError) as error:
         raise BadDataset(root, f"{file} is not readable ({_say(error)})") from error
-    return VideoIndex(np.array(pts, np.int64), np.array(keys, bool), time_base)
+    places = np.array(damaged, np.int64)
+    return VideoIndex(np.array(pts, np.int64), np.array(keys, bool), time_base, places)
 
 
 @dataclass(frozen=True)
@@ -114,11 +134,18 @@ class Cut:
     spare: int = 0
 
     def check(self, index: VideoIndex, fps: float) -> None:
-        """Check that all its pictures are there.
+        """Check that all its pictures are there and whole.
 
         Raises:
             BadDataset: If not.
         """
+        damaged = index.count_damaged(self.start, self.stop, fps)
+        if damaged:
+            raise BadDataset(
+                self.root,
+                f"{self.file} is damaged: {damaged} pictures from {self.start:.3f} s to "
+                f"{self.stop:.3f} s. `xop-curate repair` keeps the other episodes",
+            )
         missing = index.count_missing(self.start, self.length or 0, fps)
         if missing > self.spare:
             raise BadDataset(

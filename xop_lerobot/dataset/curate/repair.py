@@ -26,6 +26,7 @@ from xop_lerobot.dataset.curate.arguments import (
     make_destination,
     show_progress,
 )
+from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip
@@ -77,4 +78,5 @@ def report(wreck: Wreck) -> None:
     if not wreck.notes and not wreck.lost:
         print("nothing is wrong with it")
     frames = sum(entry.length for entry in wreck.entries)
-    print(f"whole: {len(wreck.entries)} episodes, {frames} frames. Lost: {len(wreck.lost)}")
+    whole = f"{say_count(len(wreck.entries), 'episode')}, {say_count(frames, 'frame')}"
+    print(f"whole: {whole}. Lost: {len(wreck.lost)}")

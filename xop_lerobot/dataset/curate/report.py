@@ -23,6 +23,7 @@ from xop_lerobot.command_line import CommandParser
 from xop_lerobot.dataset.curate.arguments import add_source, show_progress
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.errors import BadDataset, BadValue
+from xop_lerobot.wording import say_count
 
 SUMMARY = "write one HTML page: figures, plots, pictures and timelines of the episodes"
 
@@ -77,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         count = count_episodes(source, wanted)
         detailed = min(count, arguments.detailed)
         missing = list_missing(source.features)
-        print(f"{count} episodes, {detailed} of them with pictures and timelines")
+        print(f"{say_count(count, 'episode')}, {detailed} of them with pictures and timelines")
         if missing:
             print(f"left out, for want of columns: {'; '.join(missing)}")
         if page is None:
@@ -90,7 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
             total = source.total_episodes
             if wanted is None and not faults and report.episodes != total:
                 faults.append(
-                    f"meta/info.json counts {total} episodes, there are {report.episodes}"
+                    f"meta/info.json counts {say_count(total, 'episode')}, "
+                    f"there are {report.episodes}"
                 )
             report.finish(faults, missing)
     for fault in faults:

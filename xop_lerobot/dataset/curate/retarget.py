@@ -39,6 +39,7 @@ from xop_lerobot.dataset.curate.retarget_source import Operators, RetargetJob, p
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.dataset.facts import FACTS_DIR
 from xop_lerobot.errors import BadDataset, BadValue, XopError
+from xop_lerobot.wording import say_count
 
 SUMMARY = "replay the operators with another robot, retargeter or policy"
 
@@ -248,7 +249,7 @@ def show_plan(jobs: Iterable[RetargetJob]) -> None:
             continue
         episodes, seconds = episodes + 1, seconds + job.recording.duration
         print(f"episode {job.index}: {job.recording.duration:.1f} s of '{job.tasks[0][1]}'")
-    print(f"{episodes} episodes, {seconds:.1f} s would be replayed")
+    print(f"{say_count(episodes, 'episode')}, {seconds:.1f} s would be replayed")
 
 
 def report(root: Path, collection: Collection, path: Path | None) -> None:
@@ -276,7 +277,7 @@ def report(root: Path, collection: Collection, path: Path | None) -> None:
     print("".join(f"{head:>11}" for head in ("source", "episode", *_FIGURES.values())))
     for row in rows:
         print("".join(f"{_show(value):>11}" for value in row.values()))
-    print(f"{len(rows)} episodes in '{root}', made in {collection.wall_s:.0f} s")
+    print(f"{say_count(len(rows), 'episode')} in '{root}', made in {collection.wall_s:.0f} s")
     if path is not None:
         document = {"root": str(root), "episodes": rows, "left_out": left_out}
         write_whole(path, {**document, "wall_s": round(collection.wall_s, 3)})

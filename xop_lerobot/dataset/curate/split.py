@@ -26,6 +26,7 @@ from xop_lerobot.dataset.curate.arguments import (
 )
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.errors import BadValue
+from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip
@@ -71,10 +72,10 @@ def run(arguments: argparse.Namespace) -> int:
                     clips = _make_clips(source, chosen, quiet=arguments.quiet)
                     transfer(clips, draft / name, step)
     for name, chosen in parts.items():
-        print(f"{name}: {len(chosen)} episodes ({format_indices(chosen)})")
+        print(f"{name}: {say_count(len(chosen), 'episode')} ({format_indices(chosen)})")
     left = sorted(set(indices) - {index for chosen in parts.values() for index in chosen})
     if left:
-        print(f"in no part: {len(left)} episodes ({format_indices(left)})")
+        print(f"in no part: {say_count(len(left), 'episode')} ({format_indices(left)})")
     if destination is not None:
         print(f"written to {destination.root}")
     return 0

@@ -7,6 +7,7 @@ from typing import Any
 
 from xop_lerobot.dataset.curate.expression import Kind
 from xop_lerobot.dataset.curate.figures import FIGURES
+from xop_lerobot.wording import say_count
 
 UNKNOWN = "-"
 _HEADS = {
@@ -114,7 +115,8 @@ class Totals:
         """Format the totals, several lines."""
         hours = self._seconds / 3600
         time = f"{hours:.2f} h" if hours >= 1 else f"{self._seconds:.1f} s"
-        lines = [f"{self.episodes} episodes, {self.frames} frames, {time}, {self._idle:.1f} s idle"]
+        size = f"{say_count(self.episodes, 'episode')}, {say_count(self.frames, 'frame')}"
+        lines = [f"{size}, {time}, {self._idle:.1f} s idle"]
         if not self.episodes:
             return "0 episodes"
         lines.append(f"robots: {_list(self._robots)}")

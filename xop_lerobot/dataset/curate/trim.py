@@ -28,6 +28,7 @@ from xop_lerobot.dataset.curate.arguments import (
 from xop_lerobot.dataset.curate.measures import IDLE, Episode, find_idle
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.errors import BadDataset, BadValue
+from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip
@@ -176,8 +177,5 @@ class Trimmer:
         """Print what was cut."""
         for line in self._lines:
             print(line)
-        fps = self._source.fps
-        print(
-            f"{len(self._lines)} episodes cut, {(self._frames - self._kept) / fps:.2f} s of "
-            f"{self._frames / fps:.2f} s"
-        )
+        cut, whole = ((n / self._source.fps) for n in (self._frames - self._kept, self._frames))
+        print(f"{say_count(len(self._lines), 'episode')} cut, {cut:.2f} s of {whole:.2f} s")

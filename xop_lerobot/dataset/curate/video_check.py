@@ -1,4 +1,4 @@
-"""Whether the videos of a dataset are there and as long as its metadata says."""
+"""Whether the videos of a dataset are there, whole, and as long as its metadata says."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from pathlib import Path
 import av
 from av.error import FFmpegError
 
+from xop_lerobot.dataset.curate.pictures import VideoIndex, index_video
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
+from xop_lerobot.errors import BadDataset
 
 _HEAD = 8
 """Bytes of the size and the name of a box."""
@@ -17,7 +19,7 @@ _SLACK = 0.5
 
 
 class VideoCheck:
-    """Looks at the heads of videos, without decoding a picture; each file once.
+    """Looks at videos' heads and packets, without decoding a picture; each file once.
 
     Args:
         source: The dataset.
@@ -25,7 +27,7 @@ class VideoCheck:
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._last: dict[str, tuple[Path, str, float]] = {}
+        self._last: dict[str, tuple[Path, str, float, VideoIndex | None]] = {}
 
     def check(self, entry: EpisodeEntry) -> list[str]:
         """Say what is wrong with the videos of an episode; empty if nothing is."""
@@ -33,8 +35,8 @@ class VideoCheck:
         dt = 1 / self._source.fps
         for key, span in entry.videos.items():
             if self._last.get(key, (None,))[0] != span.file:
-                self._last[key] = (span.file, *probe(self._source.root / span.file))
-            _, fault, end = self._last[key]
+                self._last[key] = (span.file, *self._look(span.file))
+            _, fault, end, index = self._last[key]
             frames = (span.stop - span.start) / dt
             if fault:
                 problems.append(f"{span.file} is not readable ({fault})")
@@ -48,7 +50,23 @@ class VideoCheck:
                     f"episode {entry.index} has {entry.length} frames, but {frames:g} pictures of "
                     f"'{key}'"
                 )
+            damaged = index.count_damaged(span.start, span.stop, self._source.fps) if index else 0
+            if damaged:
+                problems.append(
+                    f"{span.file} is damaged: {damaged} of the {entry.length} pictures of episode "
+                    f"{entry.index}"
+                )
         return problems
+
+    def _look(self, file: Path) -> tuple[str, float, VideoIndex | None]:
+        """What is wrong with a file, when its pictures end [s], and its packets."""
+        fault, end = probe(self._source.root / file)
+        if fault:
+            return fault, end, None
+        try:
+            return fault, end, index_video(self._source.root, file)
+        except BadDataset as error:
+            return error.fault, end, None
 
 
 def probe(path: Path) -> tuple[str, float]:

@@ -34,6 +34,7 @@ from xop_lerobot.dataset.curate.salvage import CannotSalvage, salvage
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.facts import FACTS_DIR
 from xop_lerobot.errors import BadDataset
+from xop_lerobot.wording import say_count
 
 _COUNTERS = ("episode_index", "frame_index", "task_index")
 _TASKS = Path("meta") / "tasks.parquet"
@@ -310,6 +311,9 @@ class Videos:
             missing = index.count_missing(span.start, entry.length, self._fps)
             if missing > (dropped if isinstance(dropped, int) else 0):
                 return f"{missing} of its {entry.length} pictures of '{key}' are gone"
+            damaged = index.count_damaged(span.start, span.stop, self._fps)
+            if damaged:
+                return f"{damaged} of its {entry.length} pictures of '{key}' are damaged"
         return ""
 
 
@@ -327,7 +331,9 @@ def _note_strays(wreck: Wreck, info: dict[str, Any]) -> None:
     counted = info.get("total_episodes", 0)
     there = len(wreck.entries)
     if counted != there:
-        wreck.notes.append(f"meta/info.json counts {counted} episodes, {there} are whole")
+        wreck.notes.append(
+            f"meta/info.json counts {say_count(counted, 'episode')}, {there} are whole"
+        )
 
 
 def _first_line(error: BaseException) -> str:
