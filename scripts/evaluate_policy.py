@@ -1,0 +1,145 @@
+r"""Print how near a policy's hands come to their points, beside others' in the same episodes.
+
+    python scripts/evaluate_policy.py --at 6 --rollouts trained=outputs/rollout_trained \\
+        untrained=outputs/rollout_untrained
+
+Each of --rollouts is a dataset that `lerobot-rollout` recorded with a robot of this project, in a
+task that has two points (docs/training.md). All must be of the same seeds: the first is compared
+with each of the others, with a robot that stands still, and with the best that goes to the same
+places in every episode. With --margin the exit code is 1 unless it is nearer than all of them by
+so much, at the lower end of the 95% interval.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue, XopError
+
+if TYPE_CHECKING:
+    from xop_lerobot.evaluation.policy_error import Hands
+
+STILL, BLIND = "stand still", "best without looking"
+
+
+def read_rollouts(texts: list[str], at: float) -> dict[str, Hands]:
+    """Read the hands of `NAME=DIRECTORY`s.
+
+    Raises:
+        BadValue: If one is not of that form, or they are not of the same episodes.
+    """
+    from xop_lerobot.evaluation.policy_error import read_hands
+
+    found: dict[str, Hands] = {}
+    for text in texts:
+        name, _, root = text.partition("=")
+        if not name or not root or name in found:
+            raise BadValue(f"--rollouts takes NAME=DIRECTORY, each name once, got '{text}'")
+        found[name] = read_hands(Path(root), at)
+    first, *others = found.items()
+    for name, hands in others:
+        for key in ("robot", "task", "scene", "noise", "low_level", "fps", "seed"):
+            mine, its = (getattr(each.setting, key) for each in (first[1], hands))
+            if mine != its:
+                raise BadValue(f"{first[0]} has {key} {mine} and {name} {its}: not comparable")
+        if not np.array_equal(first[1].episodes, hands.episodes):
+            raise BadValue(f"{first[0]} and {name} are not of the same episodes")
+    return found
+
+
+def evaluate(rollouts: dict[str, Hands], at: float) -> dict[str, Any]:
+    """Compute what is printed, fit for JSON."""
+    from xop_lerobot.evaluation.intervals import compute_mean_interval
+    from xop_lerobot.evaluation.policy_error import (
+        compute_best_blind_error,
+        compute_margin,
+        stand_still,
+    )
+
+    first = next(iter(rollouts))
+    setting, episodes = rollouts[first].setting, rollouts[first].episodes
+    contestants = {**rollouts, STILL: stand_still(setting, episodes.tolist(), at)}
+    rows, errors = {}, {}
+    for name, hands in contestants.items():
+        errors[name] = hands.compute_errors()
+        rows[name] = {
+            "error": float(errors[name].mean()),
+            "interval": list(compute_mean_interval(errors[name].tolist())),
+            "elsewhere": float(hands.compute_errors_elsewhere().mean()),
+            "success": int(hands.success.sum()),
+            "falls": int(hands.fallen.sum()),
+            "errors": errors[name].tolist(),
+        }
+    blind = compute_best_blind_error(rollouts[first].points)
+    rivals = {name: errors[name] for name in errors if name != first}
+    rivals[BLIND] = np.full(len(episodes), blind)
+    margins = {}
+    for name, values in rivals.items():
+        margin = compute_margin(errors[first], values)
+        margins[name] = {**dataclasses.asdict(margin), "interval": list(margin.interval)}
+    return {
+        **dataclasses.asdict(setting),
+        "episodes": len(episodes),
+        "at": at,
+        "policies": rows,
+        "best_blind_error": blind,
+        "margins": margins,
+    }
+
+
+def print_table(result: dict[str, Any]) -> None:
+    """Print the figures for people."""
+    count, first = result["episodes"], next(iter(result["policies"]))
+    print(
+        f"{result['task']} with xop_{result['robot']}, seed {result['seed']}, {count} episodes, "
+        f"at {result['at']:g} s"
+    )
+    print(
+        "mean distance of the hands from their points, and from those of the other episodes [m]\n"
+    )
+    print(f"{'':22}{'own points':>10}{'95%':>18}{'others':>10}{'success':>10}{'falls':>8}")
+    for name, row in result["policies"].items():
+        low, high = row["interval"]
+        print(
+            f"{name:22}{row['error']:10.3f}{f'{low:.3f} to {high:.3f}':>18}"
+            f"{row['elsewhere']:10.3f}{row['success']:>10}{row['falls']:>8}"
+        )
+    print(f"{BLIND:22}{result['best_blind_error']:10.3f}\n")
+    for name, margin in result["margins"].items():
+        low, high = margin["interval"]
+        print(
+            f"{first} is nearer than {name} by {margin['mean']:.3f} m ({low:.3f} to {high:.3f}), "
+            f"in {margin['nearer']} of {margin['episodes']} episodes"
+        )
+
+
+def main() -> None:
+    """Evaluate, print, and write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rollouts", nargs="+", required=True, metavar="NAME=DIRECTORY")
+    parser.add_argument("--at", type=float, default=6.0, help="judged so late in an episode [s]")
+    parser.add_argument("--margin", type=float, help="asked for, over each other one [m]")
+    parser.add_argument("--json", type=Path, help="file for the figures (default: none)")
+    settings = parser.parse_args()
+    try:
+        result = evaluate(read_rollouts(settings.rollouts, settings.at), settings.at)
+    except XopError as error:
+        raise SystemExit(f"error: {error}") from error
+    print_table(result)
+    if settings.json is not None:
+        settings.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    if settings.margin is not None:
+        least = min(margin["interval"][0] for margin in result["margins"].values())
+        print(f"least margin {least:.3f} m, asked for {settings.margin:.3f} m")
+        sys.exit(0 if least >= settings.margin else 1)
+
+
+if __name__ == "__main__":
+    main()
