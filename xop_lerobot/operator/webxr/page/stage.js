@@ -24,7 +24,7 @@ void main() {
   vec2 line = abs(fract(metres - 0.5) - 0.5);
   float near = exp(-length(metres) / 5.0);
   float lit = 1.0 - smoothstep(0.0, 0.02, min(line.x, line.y));
-  gl_FragColor = vec4(vec3(0.25, 0.4, 0.55) * lit * near, 1.0);
+  gl_FragColor = vec4(vec3(0.25, 0.4, 0.55) * lit * near, 0.0);
 }`;
 
 const AWAY = 1.5; // distance of picture and words [m]
