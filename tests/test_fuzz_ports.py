@@ -24,7 +24,7 @@ def test_garbage_disturbs_nothing(name):
 
 
 def test_faults_are_found():
-    result = fuzzing.Result("x", memory=(50.0, 70.0), left=(3, 0), good=(10, 9))
+    result = fuzzing.Result("x", memory=(40.0, 50.0, 70.0), left=(3, 0), good=(10, 9))
     result.counts, result.errors = {"late": 1}, ["boom"]
     assert result.find_faults() == [
         "logged: boom",
