@@ -44,8 +44,6 @@ FARTHER = 0.055
 robot]."""
 APART = 0.12
 """So much farther apart than else the hands are when one walks up to a box [m]."""
-RAISED = 0.25
-"""So much higher they are: a robot that turns beside a box sweeps with them over it [m]."""
 STAND_NEAR = 0.06
 """How far beside where it wants to stand before the box is good enough [m]."""
 GRASPS = 4
@@ -114,7 +112,7 @@ def walk_to_box(mind: Mind) -> Doing:
         yield from set_mode(mind, Mode.MOBILE)
         hands = relaxed_hands(mind.person.size)
         hands[:, 1] += [APART, -APART]
-        hands[:, 2] += mind.person.size * RAISED
+        hands[:, 2] += mind.person.size * mind.eyes.recall("raise", 0.0)
         yield from go_to(mind, place, hands=hands, tolerance=STAND_NEAR)
     yield from set_mode(mind, Mode.STATIONARY)
 
