@@ -105,7 +105,7 @@ def test_low_points_ask_for_a_squat():
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_near_points_are_within_an_arms_length(robot):
-    """From the shoulders of a robot that stays where it is."""
+    """From the shoulders of a robot that stays where it is; 5 cm beside is touched."""
     morphology = make_morphology(robot)
     model = morphology.build_spec("full").compile()
     data = mujoco.MjData(model)
@@ -116,7 +116,7 @@ def test_near_points_are_within_an_arms_length(robot):
     reach = measure_reach(morphology)
     for left, right, _ in draw_points(robot, range(60), "dual_point_reach"):
         for shoulder, point in zip(shoulders, (left, right), strict=True):
-            assert np.linalg.norm(point - shoulder) < reach.arm
+            assert np.linalg.norm(point - shoulder) < reach.arm + 0.05
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
