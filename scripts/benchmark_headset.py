@@ -77,6 +77,10 @@ class Delays:
         self.frame: list[float] = []
         self.command: list[float] = []
         self.told: list[float] = []
+        self.parse_work: list[float] = []
+        """Time of the processor alone, which does not depend on what else the machine does."""
+        self.judge_work: list[float] = []
+        self.tick_work: list[float] = []
         self.late_ticks = 0
 
     def print(self) -> None:
@@ -85,15 +89,29 @@ class Delays:
             ("send -> OperatorFrame", self.frame),
             ("send -> command", self.command),
             ("as the device tells it", self.told),
+            ("processor: parse", self.parse_work),
+            ("processor: judge, smooth", self.judge_work),
+            ("processor: frame -> command", self.tick_work),
         ):
             if not delays:
-                print(f"  {what:24} none")
+                print(f"  {what:27} none")
                 continue
             p50, p99 = np.percentile(np.array(delays) * 1e3, [50, 99])
             print(
-                f"  {what:24} n {len(delays):5}  p50 {p50:7.2f} ms  p99 {p99:7.2f} ms  "
+                f"  {what:27} n {len(delays):5}  p50 {p50:7.2f} ms  p99 {p99:7.2f} ms  "
                 f"max {max(delays) * 1e3:7.2f} ms"
             )
+
+
+def measure_parsing(delays: Delays) -> None:
+    """Parse a thousand messages."""
+    from xop_lerobot.operator.webxr.protocol import parse_message
+
+    for number in range(1000):
+        text = json.dumps(make_message(number, number / 72))
+        begun = time.thread_time()
+        parse_message(text)
+        delays.parse_work.append(time.thread_time() - begun)
 
 
 def add_device(delays: Delays) -> None:
@@ -104,8 +122,9 @@ def add_device(delays: Delays) -> None:
 
     class Measured(WebXrDevice):
         def receive(self, frame: OperatorFrame, source_time: float | None = None) -> None:
-            before = self._newest
+            before, begun = self._newest, time.thread_time()
             super().receive(frame, source_time)
+            delays.judge_work.append(time.thread_time() - begun)
             newest = self._newest
             if newest is not None and newest is not before and source_time is not None:
                 delays.sent[newest.time] = source_time
@@ -146,8 +165,11 @@ def drive(settings: argparse.Namespace, delays: Delays) -> None:
     page.start()
     due = time.monotonic()
     while page.is_alive():
+        begun = time.thread_time()
         action, record = teleoperation.step(loop.state)
         now = time.monotonic()
+        if record.engaged:
+            delays.tick_work.append(time.thread_time() - begun)
         if record.engaged and record.frame is not None and record.frame.time in delays.sent:
             delays.command.append(now - delays.sent[record.frame.time])
             delays.told.append(device.status.delay or 0.0)
@@ -173,6 +195,7 @@ def main() -> None:
     delays = Delays()
     add_device(delays)
     drive(settings, delays)
+    measure_parsing(delays)
     print(
         f"{settings.robot}, {settings.retargeter}, loop at {settings.fps} Hz, frames at "
         f"{settings.rate:g} Hz, {len(delays.command)} ticks engaged, "
