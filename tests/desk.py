@@ -18,7 +18,7 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import Gesture, GestureConfig, GestureReader
 
 CODE = "tested7"
-GESTURES = {"Engage": "palms up, both hands pinched, held for 1 s"}
+GESTURES = {"engage": "palms up, both hands pinched, held for 1 s"}
 
 
 def make_picture(height: int = 240, width: int = 320) -> np.ndarray:

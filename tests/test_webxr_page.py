@@ -387,7 +387,7 @@ def test_a_newcomer_drives_by_mouse_and_keyboard(desk, open_at):
 def test_the_keys_can_be_pressed_on_the_page(desk, open_at):
     page = open_at(desk.address)
     page.click("#drive")
-    wait_text(page, "connection", "Connected: you drive")
+    wait_for(desk.sees_all, "a frame")
     page.hover("[data-action=engage]")
     page.mouse.down()
     wait_for(lambda: desk.engaged, "engagement")
@@ -403,6 +403,7 @@ def test_the_keys_can_be_pressed_on_the_page(desk, open_at):
 def test_a_hidden_page_lets_go(desk, open_at):
     page = open_at(desk.address)
     page.click("#drive")
+    wait_for(desk.sees_all, "a frame")
     page.keyboard.down("Space")
     wait_for(lambda: desk.engaged, "engagement")
     page.keyboard.up("Space")
@@ -557,10 +558,12 @@ def test_what_the_wearer_sees(desk, open_at):
     assert (words > 180).all(axis=2).sum() > 500  # white letters below
 
     # The words are those of the state, drawn anew only when they change.
+    assert "To engage: palms up, both hands pinched" in page.evaluate("app.hud.drawn")
     desk.changes |= {"warnings": ("The plan is late.",), "engaged": True}
     page.wait_for_function("() => app.hud.drawn.includes('The plan is late.')")
     assert "Engaged: the robot follows" in page.evaluate("app.hud.drawn")
-    assert page.evaluate("app.hud.update(app.headset.troubles)") is False
+    assert "To engage" not in page.evaluate("app.hud.drawn")
+    assert page.evaluate("[app.hud.update([]), app.hud.update([])][1]") is False
 
 
 def test_hands_that_are_lost_and_sessions_that_end(desk, open_at):

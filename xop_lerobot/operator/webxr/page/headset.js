@@ -8,7 +8,8 @@ const MODES = ['immersive-ar', 'immersive-vr'];
 /** What a session can be begun as here, or why not, in words: `{mode, trouble}`. */
 export async function findMode() {
   if (!window.isSecureContext) {
-    return { mode: null, trouble: 'A headset needs an https address, or a cable: see docs/headset.md.' };
+    const trouble = 'A headset needs an https address, or a cable: see docs/headset.md.';
+    return { mode: null, trouble };
   }
   if (!navigator.xr) return { mode: null, trouble: 'This browser has no WebXR.' };
   for (const mode of MODES) {
@@ -71,8 +72,8 @@ function readController(frame, source, space) {
 /**
  * Read head and hands.
  *
- * @returns {object} `source`, `head`, `left` and `right` of a frame of the protocol. Hands go before
- *   controllers: who lays the controllers down goes on with the hands.
+ * @returns {object} `source`, `head`, `left` and `right` of a frame of the protocol. Hands go
+ *   before controllers: who lays the controllers down goes on with the hands.
  */
 export function readFrame(frame, space) {
   const viewer = frame.getViewerPose(space);

@@ -4,7 +4,9 @@ import { describeDelay, describeMode, describeRecording, describeState } from '.
 
 const WIDTH = 1024;
 const HEIGHT = 400;
-const COLOURS = { good: '#5fd38d', plain: '#e8edf2', warn: '#ffc857', bad: '#ff7b72' };
+const COLOURS = {
+  good: '#5fd38d', plain: '#e8edf2', warn: '#ffc857', bad: '#ff7b72', soft: '#9fb0c0',
+};
 const FONT = 'system-ui, sans-serif';
 const MARGIN = 28;
 const NOTICE_S = 8; // how long the last notice stays
@@ -37,6 +39,7 @@ export class Hud {
     this.picture = null;
     this.display = null;
     this.trouble = ''; // of the connection
+    this.engage = ''; // how to engage, in words
     this.notice = '';
     this.noticeUntil = 0;
     this.drawn = '';
@@ -53,8 +56,10 @@ export class Hud {
     const notice = performance.now() < this.noticeUntil ? this.notice : '';
     const { display } = this;
     const wrong = [this.trouble, ...(display?.warnings ?? []), ...troubles].filter(Boolean);
+    const asks = display && !display.engaged && !display.fallen && this.engage;
     const lines = [describeState(display), describeMode(display), describeRecording(display),
-      describeDelay(display), wrong, notice, Math.round((display?.clutch ?? 0) * 50)];
+      describeDelay(display), wrong, notice, asks ? `To engage: ${this.engage}` : '',
+      Math.round((display?.clutch ?? 0) * 50)];
     const key = JSON.stringify(lines);
     if (key === this.drawn) return false;
     this.drawn = key;
@@ -62,7 +67,7 @@ export class Hud {
     return true;
   }
 
-  #draw(state, mode, recording, delay, wrong, notice, clutch) {
+  #draw(state, mode, recording, delay, wrong, notice, hint, clutch) {
     const context = this.canvas.getContext('2d');
     const write = (text, x, y, colour, size, weight = 400, align = 'left') => {
       context.font = `${weight} ${size}px ${FONT}`;
@@ -92,7 +97,8 @@ export class Hud {
         y += 46;
       }
     };
-    if (wrong.length) write36(`⚠ ${wrong.join('  ⚠ ')}`, COLOURS.warn, notice ? 3 : 5);
-    if (notice) write36(notice, COLOURS.plain, wrong.length ? 2 : 5);
+    if (wrong.length) write36(`⚠ ${wrong.join('  ⚠ ')}`, COLOURS.warn, notice || hint ? 3 : 5);
+    if (notice) write36(notice, COLOURS.plain, wrong.length || hint ? 2 : 5);
+    if (hint) write36(hint, COLOURS.soft, 3);
   }
 }

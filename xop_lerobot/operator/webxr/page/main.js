@@ -98,8 +98,8 @@ class App {
   }
 
   #showConnection(phase, text) {
-    const words = { open: this.link?.role === 'operator' ? 'Connected: you drive' : 'Connected: you watch' };
-    byId('connection').textContent = words[phase] ?? text;
+    const does = this.link?.role === 'operator' ? 'drive' : 'watch';
+    byId('connection').textContent = phase === 'open' ? `Connected: you ${does}` : text;
     byId('connection').className = phase;
     this.hud.trouble = phase === 'open' ? '' : text;
     if (phase !== 'open') {
@@ -137,6 +137,7 @@ class App {
       byId('title').textContent = message.robot || 'Robot';
       document.title = `Drive ${message.robot || 'a robot'}`;
       this.panel.showGestures(message.gestures);
+      this.hud.engage = message.gestures?.engage ?? '';
       this.#showConnection('open', '');
     } else if (message.type === 'display') {
       this.hud.display = message;

@@ -2,7 +2,7 @@
 
 /** Decodes what comes, camera by camera. */
 export class Pictures {
-  /** @param {function(number, ImageBitmap)} show takes the picture of a camera, 0 being the head's */
+  /** @param {function(number, ImageBitmap)} show takes the picture of a camera, the head's first */
   constructor(show) {
     this.show = show;
     this.waiting = new Map();

@@ -132,6 +132,8 @@ export class StandIn {
     const engaging = this.held.has('engage');
     this.palms.aim([engaging ? Math.PI : 0], PALMS_S);
     this.palms.step(dt);
+    // Hands must be seen open before they close, also by who has just connected.
+    const closing = engaging && this.palms.value[0] > 0.9 * Math.PI;
     this.raises.forEach((raise, side) => {
       raise.aim([this.held.has(side ? 'raiseRight' : 'raiseLeft') ? 1 : 0], PALMS_S);
       raise.step(dt);
@@ -142,7 +144,7 @@ export class StandIn {
       if (since > TAP[3]) this.taps[side] = null;
       const tapping = (since >= TAP[0] && since < TAP[1]) || (since >= TAP[2] && since < TAP[3]);
       const held = this.held.has(side ? 'pinchRight' : 'pinchLeft');
-      pinch.aim([engaging || tapping || held ? CLOSED : OPEN], PINCH_S);
+      pinch.aim([closing || tapping || held ? CLOSED : OPEN], PINCH_S);
       pinch.step(dt);
     });
   }
