@@ -228,6 +228,7 @@ def test_lerobot_calibrate_and_then_drive(tmp_path, monkeypatch, request, capsys
     robot.connect()
     robot.get_observation()
     teleop.get_action()
+    assert teleop._teleoperation is not None
     config = teleop._teleoperation.config.alignment
     assert [config.eye_height, config.arm_reach] == list(saved.values())
     kept = get_session(session).configs["teleop"]["alignment"]

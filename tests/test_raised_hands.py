@@ -61,7 +61,7 @@ def make_frames(
 
     facing = quat_from_rpy(0, 0, heading)
     frames = []
-    for t in np.arange(0, end, 1 / rate):
+    for t in map(float, np.arange(0, end, 1 / rate)):
         wrists, pinch = [], []
         for side, ups, closed in zip((1, -1), raised, pinched, strict=True):
             up = during(ups, t)
@@ -73,9 +73,7 @@ def make_frames(
         tracked = np.ones(3, dtype=bool)
         tracked[limb] = not span[0] <= t < span[1]
         head = make_pose(np.array([0, 0, 1.6]), facing)
-        frames.append(
-            OperatorFrame(float(t), head, *wrists, pinch=np.array(pinch), tracked=tracked)
-        )
+        frames.append(OperatorFrame(t, head, *wrists, pinch=np.array(pinch), tracked=tracked))
     return frames
 
 

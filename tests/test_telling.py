@@ -21,15 +21,19 @@ from xop_lerobot.retarget.online import AppliedChange
 
 
 class Fake(Device):
-    trouble = ""
+    def __init__(self, trouble: str = "") -> None:
+        self._trouble = trouble
+
+    @property
+    def trouble(self) -> str:
+        return self._trouble
 
     def read(self, time: float) -> OperatorFrame | None:
         return None
 
 
 def warn(*, tracked=(1, 1, 1), engaged=True, plan_age=None, trouble="", device=None):
-    device = device or Fake()
-    device.trouble = trouble
+    device = device or Fake(trouble)
     frame = dataclasses.replace(make_frame(0.0, (0, 0, 1.6)), tracked=np.array(tracked, dtype=bool))
     return list_warnings(device, frame, engaged=engaged, plan_age=plan_age)
 
@@ -56,7 +60,9 @@ def test_a_late_plan():
 
 def test_a_slow_stream():
     class Slow(LiveDevice):
-        address, trouble = "nowhere", ""
+        @property
+        def address(self) -> str:
+            return "nowhere"
 
         def stream(self) -> None: ...
         def interrupt(self) -> None: ...

@@ -101,8 +101,9 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Setup, tuple[str, ...], b
         if name not in CHECKS:
             raise UnknownName("check", name, CHECKS)
     fields = {each.name for each in dataclasses.fields(Setup)}
+    args.root = args.root or find_root()
     values = {name: value for name, value in vars(args).items() if name in fields}
-    return Setup(**(values | {"root": args.root or find_root()})), names, args.json
+    return Setup(**values), names, args.json
 
 
 def find_root() -> Path:
