@@ -227,9 +227,10 @@ def test_clock_that_jumps_or_is_forgotten():
 def test_delay_meter():
     meter = DelayMeter(0.3)
     assert meter.measure(0.0) is None and meter.describe(0.0) == ""
-    times = iter(np.arange(0, 100, 0.02))
+    times, now = iter(np.arange(0, 100, 0.02).tolist()), 0.0
 
     def take(seconds: float, delay: float) -> str:
+        nonlocal now
         for _ in range(round(seconds * 50)):
             now = next(times)
             late = meter.take(now, delay, 0.01)

@@ -150,7 +150,7 @@ def _parse_frame(values: Mapping[str, Any]) -> FrameMessage | str:
             tracked[1 + i] = True
         wrists.append(wrist)
     return FrameMessage(
-        number, sent / 1e3, source, OperatorFrame(0.0, head, *wrists, pinch, tracked)
+        number, sent / 1e3, source, OperatorFrame(0.0, head, *wrists, pinch=pinch, tracked=tracked)
     )
 
 
