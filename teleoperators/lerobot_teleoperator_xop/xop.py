@@ -164,10 +164,11 @@ class Xop(Teleoperator):
         if self._is_connected:
             return
         if calibrate and not self.is_calibrated:
+            who = f"of '--teleop.id={self.id}'" if self.id else "without --teleop.id"
             logger.info(
-                "No calibration of '--teleop.id=%s': your height is measured when you engage, and "
-                "your arms count as long as your height says. lerobot-calibrate measures both.",
-                self.id,
+                "No calibration %s: your height is measured when you engage, and your arms count "
+                "as long as your height says. lerobot-calibrate measures both.",
+                who,
             )
         if self.action_features:
             self._teleoperation = self._make_teleoperation(self._session.robot)
