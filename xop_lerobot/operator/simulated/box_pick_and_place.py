@@ -32,7 +32,7 @@ from xop_lerobot.operator.simulated.hands import (
     tip_hands,
 )
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.operator.simulated.walking import compute_miss, find, go_to, set_mode
+from xop_lerobot.operator.simulated.walking import compute_miss, find, glance, go_to, set_mode
 from xop_lerobot.transforms import quat_conjugate, quat_rotate, quat_yaw, wrap_angle
 
 PRESS_MORE = 0.01
@@ -44,8 +44,9 @@ FARTHER = 0.055
 robot]."""
 APART = 0.12
 """So much farther apart than else the hands are when one walks up to a box [m]."""
-STAND_NEAR = 0.06
-"""How far beside where it wants to stand before the box is good enough [m]."""
+STAND_NEAR = 0.04
+"""How far beside where it wants to stand before the box is good enough, with a robot that steps to any
+side [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""
 HOLD_S = 3.6
@@ -74,8 +75,6 @@ fast [rad/s]."""
 def carry_box(mind: Mind) -> Doing:
     """Take the box from its support to the spot on the table; who loses it takes it again."""
     yield from find(mind, "box")
-    # Nobody looks about with a box in the hands.
-    yield from find(mind, "spot")
     for attempt in range(APPROACHES):
         try:
             yield from walk_to_box(mind)
@@ -108,12 +107,16 @@ def walk_to_box(mind: Mind) -> Doing:
     distance = compute_distance(mind, [box]) + FARTHER
     place = np.array([*(box - distance * ahead)[:2], heading])
     miss, turn = compute_miss(mind, place)
-    if miss > STAND_NEAR or abs(turn) > mind.person.heading_tolerance:
+    near = mind.eyes.recall("near", STAND_NEAR)
+    if miss > near or abs(turn) > mind.person.heading_tolerance:
         yield from set_mode(mind, Mode.MOBILE)
+        yield from glance(mind, "spot")
+        if not mind.eyes.knows("spot"):  # nobody turns round to look with a box in the hands
+            yield from find(mind, "spot")
         hands = relaxed_hands(mind.person.size)
         hands[:, 1] += [APART, -APART]
         hands[:, 2] += mind.person.size * mind.eyes.recall("raise", 0.0)
-        yield from go_to(mind, place, hands=hands, tolerance=STAND_NEAR)
+        yield from go_to(mind, place, hands=hands, tolerance=near)
     yield from set_mode(mind, Mode.STATIONARY)
 
 
@@ -148,7 +151,7 @@ def keep_distance(mind: Mind) -> Doing:
     ahead = compute_ahead(compute_heading(head[3:]))
     error = float((box - head)[:3] @ ahead) - compute_reach(mind) - FARTHER
     mind.note(f"box {100 * error:.0f} cm too far")
-    if abs(error) > 0.5 * STAND_NEAR:
+    if abs(error) > 0.5 * mind.eyes.recall("near", STAND_NEAR):
         yield from lean(mind, {"both": error * ahead})
 
 
