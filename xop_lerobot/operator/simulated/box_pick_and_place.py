@@ -45,8 +45,7 @@ robot]."""
 APART = 0.12
 """So much farther apart than else the hands are when one walks up to a box [m]."""
 STAND_NEAR = 0.04
-"""How far beside where it wants to stand before the box is good enough, with a robot that steps to any
-side [m]."""
+"""How far beside where it wants to stand before the box is good enough [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""
 HOLD_S = 3.6
