@@ -100,12 +100,13 @@ def recorded(tmp_path_factory):
     config = CollectConfig(
         "rby1", "dual_point_reach", seed=4, method="direct", width=32, height=24, video=False
     )
+    folder = tmp_path_factory.mktemp("reached")
     collector = Collector(config, run=0.0)
     try:
-        collector.make(0, tmp_path_factory.mktemp("recorded"))
+        collector.make(0, folder)
     finally:
         collector.close()
-    return tmp_path_factory.getbasetemp() / "recorded0" / DATASET
+    return folder / DATASET
 
 
 @pytest.mark.slow

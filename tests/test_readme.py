@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import lerobot_teleoperator_xop  # noqa: F401  registers robots and teleoperator
+from xop_lerobot.doctor.cli import parse_arguments as parse_doctor
 from xop_lerobot.evaluation.bench import parse_arguments as parse_bench
 from xop_lerobot.operator.recording import load_recording
 
@@ -56,6 +57,8 @@ def find_config_class(name: str) -> type:
         from lerobot.scripts.lerobot_replay import ReplayConfig as Config
     elif name == "lerobot-train":
         from lerobot.configs.train import TrainPipelineConfig as Config
+    elif name == "lerobot-calibrate":
+        from lerobot.scripts.lerobot_calibrate import CalibrateConfig as Config
     elif name == "lerobot-rollout":
         from lerobot.rollout import RolloutConfig as Config
     else:
@@ -111,8 +114,8 @@ def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.Monk
     if command[0] == "xop-control":
         check_control(command[1:])
         return
-    if command[0] == "xop-bench":
-        parse_bench(command[1:])
+    if command[0] in {"xop-bench", "xop-doctor"}:
+        (parse_bench if command[0] == "xop-bench" else parse_doctor)(command[1:])
         return
     if command[0] == "xop-collect":
         from xop_lerobot.dataset.collect import parse_arguments as parse_collect

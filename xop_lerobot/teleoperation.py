@@ -17,6 +17,7 @@ from xop_lerobot.morphology.reach import compute_forward_reach
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
 from xop_lerobot.operator.clutch import Clutch
+from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, Wish
 from xop_lerobot.operator.engagement import Engagement
@@ -77,8 +78,8 @@ class Teleoperation:
     def __init__(self, config: TeleoperationConfig, info: RobotInfo) -> None:
         self.config, self.info, self.morphology = config, info, info.morphology
         self.dt = 1 / info.fps
-        self.device = make_device(config.device)
-        self.device.introduce(info.name, explain_gestures(config.gestures))
+        device = make_device(config.device)
+        device.introduce(info.name, explain_gestures(config.gestures))
         self._settings = OnlineSettings(self.morphology, config.retargeter)
         model = build_model(self.morphology, "planning", scene=info.scene)
         policy = make_policy(info.low_level, info.low_level_path)
@@ -94,7 +95,7 @@ class Teleoperation:
             self.retargeter, self.morphology, self.dt, realtime=info.realtime
         )
         self._velocity = GoalVelocity()
-        has_person = not self.device.self_engaging
+        has_person = not device.self_engaging
         self._hands = Hands(config.gestures, has_person=has_person)
         self._has_person = has_person
         self._blend = HandBlend()
@@ -103,7 +104,7 @@ class Teleoperation:
         if config.alignment.arm_reach is not None:
             reach = compute_forward_reach(self.morphology, model)
         self._engagement = Engagement(
-            self.device,
+            device,
             Alignment(config.alignment),
             Clutch(config.gestures.clutch) if has_person else None,
             self._board,
@@ -241,6 +242,15 @@ class Teleoperation:
     @alignment.setter
     def alignment(self, alignment: Alignment) -> None:
         self._engagement.alignment = alignment
+
+    @property
+    def device(self) -> Device:
+        """Where the operator's motion comes from."""
+        return self._engagement.device
+
+    @device.setter
+    def device(self, device: Device) -> None:
+        self._engagement.device = device
 
     def step(self, state: RobotState) -> tuple[RobotAction, TickRecord]:
         """Decide what the robot does next.

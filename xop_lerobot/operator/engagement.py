@@ -50,7 +50,7 @@ class Engagement:
         end: Callable[[], None],
     ) -> None:
         self.alignment, self.clutch = alignment, clutch
-        self._device, self._board = device, board
+        self.device, self._board = device, board
         self._robot_reach = robot_reach
         self._begin, self._end = begin, end
         self._was_engaged = False
@@ -93,7 +93,7 @@ class Engagement:
         if self.clutch is not None:
             self._follow_clutch(self.clutch, state, frame, poses)
             return frame
-        is_over = state.fallen or self._device.is_paused(state.time)
+        is_over = state.fallen or self.device.is_paused(state.time)
         if self.is_engaged:
             if frame is None or is_lost(frame) or is_over:
                 self.disengage()
@@ -101,9 +101,9 @@ class Engagement:
         if not state.settled or is_over:
             return frame
         if not self._started:
-            self._device.start(state.time)
+            self.device.start(state.time)
             self._started = True
-            frame = self._device.read(state.time)
+            frame = self.device.read(state.time)
         if frame is not None and not is_lost(frame):
             self._engage_itself(state, frame, poses)
         return frame
@@ -134,7 +134,7 @@ class Engagement:
             if state.fallen:
                 self._let_go("the robot has fallen")
             elif wish is Wish.LET_GO and (frame is None or is_lost(frame)):
-                self._let_go(self._device.trouble or UNSEEN)
+                self._let_go(self.device.trouble or UNSEEN)
             elif wish is Wish.LET_GO:
                 self._let_go("you have let go")
             return
