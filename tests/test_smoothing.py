@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xop_lerobot.command import CommandDim, CommandSpace, Gentleness, Mode, RobotAction
+from xop_lerobot.command import CommandDim, CommandSpace, Mode, RobotAction
 from xop_lerobot.errors import BadShape, BadValue
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import limit_action
@@ -133,23 +133,6 @@ def test_after_somebody_else_drove_it_starts_from_rest():
     executed = np.array([-0.1, 0, 0])
     sent, _ = smoother.smooth(np.array([0.3, 0, 0]), Mode.MOBILE, executed, Mode.MOBILE)
     assert sent[0] == pytest.approx(-0.1 + 4.0 * 0.04**2)
-
-
-def test_who_carries_something_moves_gently():
-    """Speeds and rates keep to their share, also from a speed that is beyond it."""
-    gentle = Gentleness(speed=0.4, rate=0.3)
-    for start in (0.0, 0.8):
-        smoother = CommandSmoother(SPACE, 0.04)
-        executed, commands = np.array([0, start, 0]), []
-        for _ in range(60):
-            wanted = np.array([1.0, 2.0, 1.0])
-            sent, _ = smoother.smooth(wanted, Mode.MOBILE, executed, Mode.MOBILE, gentle)
-            smoother.note(executed, sent)
-            executed = sent
-            commands.append(sent)
-        steps = np.diff(commands, axis=0)
-        assert (np.abs(steps) <= 0.3 * SPACE.max_rate * 0.04 + 1e-9).all()
-        np.testing.assert_allclose(commands[-1], [0.3, 0.4, 1.0], atol=1e-6)
 
 
 def test_single_precision_of_the_action_does_not_upset_it():

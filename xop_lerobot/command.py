@@ -69,19 +69,6 @@ class CommandDim:
 
 
 @dataclass(frozen=True)
-class Gentleness:
-    """What is left to a robot that carries something between its hands.
-
-    Attributes:
-        speed: Share of the largest speeds.
-        rate: Share of the largest rate of every command.
-    """
-
-    speed: float = 1.0
-    rate: float = 1.0
-
-
-@dataclass(frozen=True)
 class CommandSpace:
     r"""The admissible set :math:`\mathcal A = \{a \mid a_{min} \le a \le a_{max}\}` (Eq. 1d).
 

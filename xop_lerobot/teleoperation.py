@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from xop_lerobot.command import Gentleness, Mode, RobotAction
+from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.errors import XopError
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import make_policy
@@ -286,7 +286,7 @@ class Teleoperation:
             wanted = self._hold(state)
         else:
             wanted = self._drive(state, goal, poses["head"], dt)
-        action = self._limit(state, wanted, goal)
+        action = self._limit(state, wanted)
         self._shown = self._make_display(state, frame, engaged=goal is not None)
         return action, self._make_record(measured, synced, frame, goal, wanted, changes)
 
@@ -413,13 +413,10 @@ class Teleoperation:
         command = current.get_command(state.time, self.morphology.command_space)
         return RobotAction(command, goal.mode, arms)
 
-    def _limit(self, state: RobotState, wanted: RobotAction, goal: Goal | None) -> RobotAction:
+    def _limit(self, state: RobotState, wanted: RobotAction) -> RobotAction:
         """What the robot will execute: bounds, rates and changes of rate, as it limits too."""
-        gentleness = Gentleness()
-        if goal is not None and goal.mode is Mode.MOBILE and self._arms.hold.is_holding:
-            gentleness = self.morphology.laden
         command, mode = self._smoother.smooth(
-            wanted.command, wanted.mode, state.command, state.mode, gentleness
+            wanted.command, wanted.mode, state.command, state.mode
         )
         previous = RobotAction(state.command, state.mode, state.arms)
         smooth = RobotAction(command, mode, wanted.arms)

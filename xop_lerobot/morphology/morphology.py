@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from xop_lerobot.command import ActionLayout, CommandSpace, Gentleness, Mode, RobotAction
+from xop_lerobot.command import ActionLayout, CommandSpace, Mode, RobotAction
 from xop_lerobot.morphology.effect import Effect
 from xop_lerobot.registry import Registry
 from xop_lerobot.retarget.config import MpcConfig, PaperParameters
@@ -95,8 +95,6 @@ class Morphology(ABC):
 
     ramps: bool = False
     """Whether its controller goes from each set of targets to the next in a straight line."""
-    laden: Gentleness = Gentleness()
-    """How gently it moves about with something between its hands."""
     variants: Mapping[str, Variant] = {"v1": Variant()}
     """Bindings of targets to the body by name; the first is the default."""
     effects: tuple[Effect, ...]

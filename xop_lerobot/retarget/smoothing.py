@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.command import CommandSpace, Gentleness, Mode, check_vector
+from xop_lerobot.command import CommandSpace, Mode, check_vector
 
 _AT_REST = 1e-9  # velocities up to here are neutral [their unit]
 
@@ -35,12 +35,7 @@ class CommandSmoother:
         self._step = np.zeros(len(self.space))
 
     def smooth(
-        self,
-        command: np.ndarray,
-        mode: Mode,
-        executed: np.ndarray,
-        executed_mode: Mode,
-        gentleness: Gentleness = Gentleness(),  # noqa: B008  it is frozen
+        self, command: np.ndarray, mode: Mode, executed: np.ndarray, executed_mode: Mode
     ) -> tuple[np.ndarray, Mode]:
         """Compute what to send after what is being executed; `note` what became of it.
 
@@ -49,7 +44,6 @@ class CommandSmoother:
             mode: Mode that is wanted.
             executed: Command being executed. Shape (k,).
             executed_mode: Mode being executed.
-            gentleness: Shares of speeds and rates to stay within.
 
         Returns:
             The command and the mode to send: still mobile while velocities are stopping. (k,).
@@ -59,10 +53,6 @@ class CommandSmoother:
         if mode is Mode.STATIONARY and executed_mode is Mode.MOBILE:
             stops, mode = True, Mode.MOBILE
             command = np.where(space.mobile_only, space.neutral, command)
-        slow = space.neutral + gentleness.speed * np.stack(
-            [space.low - space.neutral, space.high - space.neutral]
-        )
-        command = np.where(space.mobile_only, np.clip(command, *slow), command)
         if self._sent is None or not np.array_equal(executed, self._sent):
             self._step = np.zeros(len(space))  # somebody else drove the robot
         wanted = space.limit(command, None, self.dt, mode)
@@ -71,8 +61,6 @@ class CommandSmoother:
             np.abs(step), compute_braking_step(np.abs(wanted - executed), self._gain)
         )
         step = np.clip(step, self._step - self._gain, self._step + self._gain)
-        most = gentleness.rate * space.max_rate * self.dt
-        step = np.clip(step, -most, most)
         # What still moves towards a bound must be able to stop there.
         rise = compute_braking_step(np.maximum(space.high - executed, 0), self._gain)
         fall = compute_braking_step(np.maximum(executed - space.low, 0), self._gain)

@@ -99,17 +99,11 @@ class BoxPickAndPlace(Task):
           far as possible, but the arms, which are thicker than the hands, must not touch it.
         - `palm_outside`: a palm's site is so far outside of the box's side when the hand touches.
         - `press`: wrist goals go so far further in, which presses the box.
-        - `raise`: hands are held so much higher while one walks up to the box: a robot on wheels
-          turns where it stands to get anywhere, and sweeps with its hands over the box.
-        - `near`: so far beside where one wants to stand before the box is good enough: on wheels
-          every centimetre to the side takes two turns beside the box.
         """
         return {
             "palm_forward": min(-self.pad.forward, -self.pad.wrist_end - BOX[0] - WRIST_GAP),
             "palm_outside": self.pad.depth,
             "press": PRESS.get(self.morphology.name, 0.05),
-            "raise": RAISE if self.morphology.wheeled else 0.0,
-            "near": NEAR[self.morphology.wheeled],
         }
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
@@ -231,9 +225,5 @@ class BoxPickAndPlace(Task):
         return seen
 
 
-RAISE = 0.25
-"""How far over the box hands are that a turning robot shall not sweep it down with [m]."""
-NEAR = {False: 0.04, True: 0.06}
-"""How near one stands to where one wants to, on legs and on wheels [m]."""
 PRESS = {"g1": 0.02, "rby1": 0.01}
 """How far inside wrist goals have to be for a grip that holds, by robot [m]; see docs/tasks.md."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.command import CommandDim, CommandSpace, Gentleness, Mode
+from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.morphology import (
     MORPHOLOGIES,
     ArmChain,
@@ -126,8 +126,6 @@ class RBY1(Morphology):
     wheeled = True
     # Its servos follow within 10 ms: targets in steps would shake the hands.
     ramps = True
-    # A base that darts about under a waist that turns back shakes a box out of the hands.
-    laden = Gentleness(speed=0.4, rate=0.3)
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
         """Build RB-Y1 alone."""

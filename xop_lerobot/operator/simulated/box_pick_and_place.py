@@ -106,16 +106,12 @@ def walk_to_box(mind: Mind) -> Doing:
     distance = compute_distance(mind, [box]) + FARTHER
     place = np.array([*(box - distance * ahead)[:2], heading])
     miss, turn = compute_miss(mind, place)
-    near = mind.eyes.recall("near", STAND_NEAR)
-    if miss > near or abs(turn) > mind.person.heading_tolerance:
+    if miss > STAND_NEAR or abs(turn) > mind.person.heading_tolerance:
         yield from set_mode(mind, Mode.MOBILE)
         yield from glance(mind, "spot")
-        if not mind.eyes.knows("spot"):  # nobody turns round to look with a box in the hands
-            yield from find(mind, "spot")
         hands = relaxed_hands(mind.person.size)
         hands[:, 1] += [APART, -APART]
-        hands[:, 2] += mind.person.size * mind.eyes.recall("raise", 0.0)
-        yield from go_to(mind, place, hands=hands, tolerance=near)
+        yield from go_to(mind, place, hands=hands, tolerance=STAND_NEAR)
     yield from set_mode(mind, Mode.STATIONARY)
 
 
@@ -150,7 +146,7 @@ def keep_distance(mind: Mind) -> Doing:
     ahead = compute_ahead(compute_heading(head[3:]))
     error = float((box - head)[:3] @ ahead) - compute_reach(mind) - FARTHER
     mind.note(f"box {100 * error:.0f} cm too far")
-    if abs(error) > 0.5 * mind.eyes.recall("near", STAND_NEAR):
+    if abs(error) > 0.5 * STAND_NEAR:
         yield from lean(mind, {"both": error * ahead})
 
 
