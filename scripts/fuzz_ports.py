@@ -33,15 +33,16 @@ def main() -> int:
         "avp": lambda: fuzzing.fuzz_avp(settings.bytes, settings.seed),
     }
     print(
-        "port         | bytes | connections | s | MB at 10 %, 50 %, the end | objects | "
+        "port         | bytes | connections | s | MB at 10 %, 50 %, the end of each kind | objects | "
         "good: sent, taken | longest gap, without garbage [s]"
     )
     failed = False
     for name in settings.ports:
         r = runs[name]()
+        memory = "; ".join(", ".join(f"{each:.1f}" for each in kind) for kind in r.memory)
         print(
-            f"{r.port:12} | {r.sent} | {r.connections} | {r.seconds:.0f} | {r.memory[0]:.1f}, "
-            f"{r.memory[1]:.1f}, {r.memory[2]:.1f} | {r.objects[0]}, {r.objects[1]} | "
+            f"{r.port:12} | {r.sent} | {r.connections} | {r.seconds:.0f} | {memory} | "
+            f"{r.objects[0]}, {r.objects[1]} | "
             f"{r.good[0]}, {r.good[1]} | {r.longest_gap[0]:.2f}, {r.longest_gap[1]:.2f}",
             flush=True,
         )

@@ -49,8 +49,9 @@ class Result:
         sent: Bytes of garbage that went in.
         connections: Over how many connections.
         seconds: For how long.
-        memory: Resident memory of the process after a tenth and after half of the bytes, and at
-            the end [MB]. The system's allocator keeps what it has once given.
+        memory: Resident memory of the process in each kind of attack: after a tenth and after
+            half of its bytes, and at its end [MB]. The system's allocator keeps what it has once
+            given, and what is used for the first time in a later kind is taken then.
         objects: Python's own objects after a tenth of the bytes, and at the end.
         left: Threads and open files more than before.
         good: Messages of the stream that goes on beside: sent, and taken.
@@ -63,7 +64,7 @@ class Result:
     sent: int = 0
     connections: int = 0
     seconds: float = 0.0
-    memory: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    memory: list[tuple[float, float, float]] = field(default_factory=list)
     objects: tuple[int, int] = (0, 0)
     left: tuple[int, int] = (0, 0)
     good: tuple[int, int] = (0, 0)
@@ -71,11 +72,21 @@ class Result:
     longest_gap: tuple[float, float] = (0.0, 0.0)
     errors: list[str] = field(default_factory=list)
 
-    def find_faults(self, growth_mb: float = 4.0) -> list[str]:
-        """What was disturbed; empty if nothing was."""
+    def find_faults(self, growth_mb: float = 4.0, whole_mb: float = 25.0) -> list[str]:
+        """What was disturbed; empty if nothing was.
+
+        Args:
+            growth_mb: Memory may grow by so much in the second half of each kind of attack [MB].
+            whole_mb: And by so much from the first tenth to the very end [MB].
+        """
         faults = [f"logged: {error}" for error in self.errors[:3]]
-        if self.memory[2] - self.memory[1] > growth_mb:
-            faults.append(f"memory grew from {self.memory[1]:.1f} to {self.memory[2]:.1f} MB")
+        for _, middle, end in self.memory:
+            if end - middle > growth_mb:
+                faults.append(f"memory grew from {middle:.1f} to {end:.1f} MB")
+        if self.memory and self.memory[-1][2] - self.memory[0][0] > whole_mb:
+            faults.append(
+                f"memory grew from {self.memory[0][0]:.1f} to {self.memory[-1][2]:.1f} MB in all"
+            )
         if self.objects[1] > self.objects[0] + 5_000:
             faults.append(f"objects grew from {self.objects[0]} to {self.objects[1]}")
         if self.left[0] > 2 or self.left[1] > 4:
@@ -293,20 +304,21 @@ class Attack:
         start = subject.ask()
         warm: dict[str, Any] | None = None
         middle: dict[str, Any] | None = None
-        begun = time.monotonic()
+        begun, sent_before = time.monotonic(), result.sent
+        share = self._total - sent_before
         while result.sent < self._total:
             attack = attacks[result.connections % len(attacks)]
             with contextlib.suppress(OSError, WebSocketException):  # it has hung up
                 result.sent += attack()
             result.connections += 1
-            if warm is None and result.sent >= self._total / 10:
+            if warm is None and result.sent - sent_before >= share / 10:
                 warm = subject.ask()
-            if middle is None and result.sent >= self._total / 2:
+            if middle is None and result.sent - sent_before >= share / 2:
                 middle = subject.ask()
         result.seconds += time.monotonic() - begun
         end = self._settle(start)
         warm = warm or start
-        result.memory = warm["memory"], (middle or warm)["memory"], end["memory"]
+        result.memory.append((warm["memory"], (middle or warm)["memory"], end["memory"]))
         result.objects = warm["objects"], end["objects"]
         result.longest_gap = max(each.get("gap", 0.0) for each in (warm, middle or warm, end)), 0.0
         result.left = end["threads"] - start["threads"], end["files"] - start["files"]
@@ -409,9 +421,9 @@ def fuzz_webxr(total: int, seed: int = 0, tls: bool = False) -> Result:
     result.good, result.counts = (good.sent, status["taken"]), status["counts"]
     result.longest_gap = max(result.longest_gap[0], status["gap"]), quiet
     page.close()
-    memory, gaps = result.memory[:2], result.longest_gap
+    gaps = result.longest_gap
     Attack(result, total, subject).run([send_json, send_frames])  # now there is room to drive
-    result.memory, result.longest_gap = (*memory, result.memory[2]), gaps
+    result.longest_gap = gaps
     subject.stop()
     return result
 
@@ -519,7 +531,7 @@ def fuzz_avp(total: int, seed: int = 0) -> Result:
 
     start = subject.ask()
     Attack(result, total * 9 // 10, subject).run([send_messages])
-    memory, gaps = result.memory[:2], result.longest_gap
+    gaps = result.longest_gap
     server.close()
 
     with socket.create_server(("127.0.0.1", port)) as listener:
@@ -543,7 +555,7 @@ def fuzz_avp(total: int, seed: int = 0) -> Result:
         again.send(make_person(time.monotonic(), False))
         time.sleep(0.02)
     result.good = 5, min(status["taken"] - before, 5)
-    result.memory, result.longest_gap = (*memory, result.memory[2]), gaps
+    result.longest_gap = gaps
     result.left = status["threads"] - start["threads"], status["files"] - start["files"]
     subject.stop()
     again.close()

@@ -24,11 +24,13 @@ def test_garbage_disturbs_nothing(name):
 
 
 def test_faults_are_found():
-    result = fuzzing.Result("x", memory=(40.0, 50.0, 70.0), left=(3, 0), good=(10, 9))
+    memory = [(40.0, 50.0, 53.0), (60.0, 62.0, 70.0)]
+    result = fuzzing.Result("x", memory=memory, left=(3, 0), good=(10, 9))
     result.counts, result.errors = {"late": 1}, ["boom"]
     assert result.find_faults() == [
         "logged: boom",
-        "memory grew from 50.0 to 70.0 MB",
+        "memory grew from 62.0 to 70.0 MB",
+        "memory grew from 40.0 to 70.0 MB in all",
         "3 threads and 0 files are left",
         "only 9 of 10 good messages were taken: {'late': 1}",
     ]
