@@ -33,7 +33,7 @@ def main() -> int:
         "avp": lambda: fuzzing.fuzz_avp(settings.bytes, settings.seed),
     }
     print(
-        "port         | bytes | connections | s | MB at 10 %, 50 %, the end of each kind | objects | "
+        "port         | bytes | connections | s | MB at 10 %, 50 %, end of each kind | objects | "
         "good: sent, taken | longest gap, without garbage [s]"
     )
     failed = False
