@@ -125,3 +125,13 @@ class Rig:
     def close(self) -> None:
         self.teleop.disconnect()
         self.loop.close()
+
+    def assert_left_arm_stood(self, ticks: slice) -> None:
+        """The left hand's goal stood still beside the head, while the right one's moved."""
+        goals = [record.goal for _, record in self.ticks[ticks]]
+        spans = {}
+        for name in ("left_wrist", "right_wrist"):
+            offsets = np.array([g.poses[name][:3] - g.poses["head"][:3] for g in goals])
+            spans[name] = np.ptp(offsets, axis=0).max()
+        assert spans["left_wrist"] < 0.01  # it turns with the head
+        assert spans["right_wrist"] > 0.03

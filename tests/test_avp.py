@@ -13,22 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 from avp_server import AvpServer, encode, set_matrix, wait_for
+from swaying import make_person
 
 from xop_lerobot.errors import BadValue
 from xop_lerobot.operator.devices import DeviceConfig, live, make_device
 from xop_lerobot.operator.devices.avp import AvpDevice
 from xop_lerobot.operator.devices.avp_protocol import HandUpdate, make_request, parse_update
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.transforms import make_pose, quat_exp, quat_rotate
-
-
-def make_person(t: float) -> OperatorFrame:
-    sway = 0.01 * np.array([np.sin(3 * t), np.cos(2 * t), np.sin(5 * t)])
-    quat = quat_exp(sway)
-    wrists = [make_pose(sway + [0.3, y, 1.1], quat) for y in (0.2, -0.2)]
-    return OperatorFrame(
-        t, make_pose(sway + [0, 0, 1.6], quat), *wrists, pinch=np.array([0.07, 0.02])
-    )
+from xop_lerobot.transforms import quat_rotate
 
 
 @pytest.fixture

@@ -6,10 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+from reached import collect_reach
 
-from xop_lerobot.dataset.collect_config import CollectConfig
-from xop_lerobot.dataset.collect_folder import DATASET
-from xop_lerobot.dataset.collect_worker import Collector
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.errors import BadDataset, BadValue
 from xop_lerobot.evaluation.policy_error import (
@@ -97,16 +95,7 @@ def test_a_robot_that_stands_still_stays_away():
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """An episode of a person who reaches the points."""
-    config = CollectConfig(
-        "rby1", "dual_point_reach", seed=4, method="direct", width=32, height=24, video=False
-    )
-    folder = tmp_path_factory.mktemp("reached")
-    collector = Collector(config, run=0.0)
-    try:
-        collector.make(0, folder)
-    finally:
-        collector.close()
-    return folder / DATASET
+    return collect_reach(tmp_path_factory.mktemp("reached"), seed=4, width=32, height=24)
 
 
 @pytest.mark.slow

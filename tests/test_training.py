@@ -23,12 +23,10 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from reached import collect_reach
 
 from lerobot_robot_xop import XopG1Config, XopRby1Config
 from lerobot_robot_xop.xop_robot import XopG1, XopRby1
-from xop_lerobot.dataset.collect_config import CollectConfig
-from xop_lerobot.dataset.collect_folder import DATASET
-from xop_lerobot.dataset.collect_worker import Collector
 from xop_lerobot.dataset.columns import OWN_PREFIXES, Columns
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.dataset.record import build_features
@@ -97,16 +95,7 @@ def test_the_configuration_that_is_shipped():
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory) -> Path:
     """An episode of a person who reaches two points, with tiny pictures and no planner."""
-    config = CollectConfig(
-        "rby1", "dual_point_reach", method="direct", width=WIDTH, height=HEIGHT, video=False
-    )
-    folder = tmp_path_factory.mktemp("collected")
-    collector = Collector(config, run=0.0)
-    try:
-        collector.make(0, folder)
-    finally:
-        collector.close()
-    return folder / DATASET
+    return collect_reach(tmp_path_factory.mktemp("collected"), width=WIDTH, height=HEIGHT)
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from avp_server import wait_for
 from PIL import Image
+from swaying import make_person
 from webxr_client import CODE, Page, encode, find_port
 
 from xop_lerobot.command import Mode
@@ -24,19 +25,10 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.clock_offset import ClockOffset
 from xop_lerobot.operator.webxr.delay_meter import DelayMeter
 from xop_lerobot.operator.webxr.protocol import Bye, FrameMessage, Pong, parse_message
-from xop_lerobot.transforms import make_pose, quat_exp, quat_from_matrix, quat_rotate
+from xop_lerobot.transforms import quat_from_matrix, quat_rotate
 
 RIGHT, UP, BACK = np.eye(3)
 LEFT, DOWN, FORWARD = -RIGHT, -UP, -BACK
-
-
-def make_person(t: float) -> OperatorFrame:
-    sway = 0.01 * np.array([np.sin(3 * t), np.cos(2 * t), np.sin(5 * t)])
-    quat = quat_exp(sway)
-    wrists = [make_pose(sway + [0.3, y, 1.1], quat) for y in (0.2, -0.2)]
-    return OperatorFrame(
-        t, make_pose(sway + [0, 0, 1.6], quat), *wrists, pinch=np.array([0.07, 0.02])
-    )
 
 
 # -- frames, by hand -----------------------------------------------------------------------

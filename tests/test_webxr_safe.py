@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 from avp_server import wait_for
 from cryptography import x509
-from test_webxr import make_person, send
+from swaying import make_person
+from test_webxr import send
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from webxr_client import CODE, Page, encode, find_port
 

@@ -6,16 +6,19 @@ import socket
 
 from xop_lerobot.doctor.finding import Finding, Level, Setup
 
-WEBXR_PORT, AVP_PORT = 8012, 12345
 TIMEOUT_S = 3.0
 
 
 def check_ports(setup: Setup) -> Finding:
     """Listen at the port of the page, or knock at that of a Vision Pro."""
+    # Where the protocols are not installed, this check fails alone.
+    from xop_lerobot.operator.devices import avp_protocol  # noqa: PLC0415
+    from xop_lerobot.operator.webxr import protocol as webxr_protocol  # noqa: PLC0415
+
     if setup.device == "avp":
-        return _knock(setup.host, setup.port or AVP_PORT)
+        return _knock(setup.host, setup.port or avp_protocol.PORT)
     host = setup.host or "127.0.0.1"
-    return _listen(host, setup.port or WEBXR_PORT)
+    return _listen(host, setup.port or webxr_protocol.PORT)
 
 
 def _listen(host: str, port: int) -> Finding:

@@ -34,16 +34,16 @@ GRIP_TO_WRIST = 0.08
 
 # Our axes in those of a joint, as columns. Heads and wrists of WebXR lie as its world does when
 # ours do: x right, y up or out of the back of the hand, z back or away from the fingers.
-_PARALLEL = WORLD.T
+PARALLEL = WORLD.T
 # A grip has z from the thumb along the rod that is held, x out of the back of a right hand and
 # into that of a left one, and y towards the forearm.
-_GRIPS = {
+GRIPS = {
     "left": np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]),
     "right": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
 }
 _WORLD_QUAT = quat_from_matrix(WORLD)
-_PARALLEL_QUAT = quat_from_matrix(_PARALLEL)
-_GRIP_QUATS = {side: quat_from_matrix(axes) for side, axes in _GRIPS.items()}
+_PARALLEL_QUAT = quat_from_matrix(PARALLEL)
+_GRIP_QUATS = {side: quat_from_matrix(axes) for side, axes in GRIPS.items()}
 _NOWHERE = np.full(7, np.nan)
 
 
