@@ -109,6 +109,22 @@ def test_a_way_computed_anew_goes_on_as_before(planner, rby1):
     np.testing.assert_allclose(rest.offsets, whole.offsets[12 : 12 + len(rest.offsets)], atol=1e-9)
 
 
+@pytest.mark.parametrize("yaw", [1.5, -1.5])
+def test_the_base_turns_where_arms_are_in_the_way_of_the_waist(planner, rby1, yaw):
+    """A quarter turn is left to the waist; with tucked elbows the base does what they bar."""
+    qpos, head = place(rby1)
+    goal = make_goal(0, 0, yaw)
+    free = planner.plan(qpos, (0.0, 0.0), "head", head, goal, 6.0)
+    barred = planner.plan(qpos, (0.0, 0.0), "head", head, goal, 6.0, room=0.8)
+    assert abs(free.headings[-1]) < 0.1
+    assert abs(yaw - barred.headings[-1]) == pytest.approx(0.8, abs=0.05)
+    # Until the base has come round, the head waits where the elbows let it.
+    twists = barred.headings - yaw - barred.turns
+    assert np.abs(twists).max() < 0.95
+    assert abs(barred.turns[0]) == pytest.approx(1.5)
+    assert barred.turns[-1] == pytest.approx(0.0)
+
+
 def test_where_the_world_lies_does_not_matter(planner, rby1):
     route = go(planner, rby1, make_goal(0.4, 1.0, 0.5))
     world = make_pose([3, -2, 0], quat_from_yaw(2.0))
@@ -157,7 +173,7 @@ def test_who_is_led_along_a_way(name, led):
     executed = retargeter.space.neutral
 
     def lead(goal):
-        return guidance.lead(qpos, executed, {"head": head}, goal, config)
+        return guidance.lead(qpos, executed, {"head": head}, goal, config, time=0.0)
 
     goals, facing = lead(Goal({"head": target}, mode=Mode.MOBILE))
     assert goals["head"].shape == (len(compute_times(config)), 7)
@@ -186,6 +202,7 @@ def test_a_base_that_may_not_be_moved_has_no_way():
         {"left_wrist": hand},
         Goal({"left_wrist": target}, mode=Mode.MOBILE),
         retargeter.configs[Mode.MOBILE],
+        time=0.0,
     )
     np.testing.assert_allclose(goals["left_wrist"][:, 1], target[1])
     assert not facing.any()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -29,6 +30,7 @@ class FacingRule:
         poses: Mapping[str, np.ndarray],
         then: Mapping[str, np.ndarray],
         dt: float,
+        room: float = math.inf,
     ) -> np.ndarray:
         """Compute where the base shall face. A hand looks nowhere: for it, as it faces now.
 
@@ -37,6 +39,7 @@ class FacingRule:
             poses: Pose of each tracked frame now. Shapes (7,).
             then: Its goal in `dt`. Shapes (1, 7).
             dt: Time to get there [s].
+            room: How far the arms let the waist twist [rad].
 
         Returns:
             Direction in the world, as long as it counts. Shape (2,).
@@ -49,7 +52,8 @@ class FacingRule:
                 look = float(quat_yaw(goals[0, 3:]))
                 end = goals[0, :2] + (pivot - self._resting[name]) * _direction(look)
                 velocity = (end - qpos[:2] - pivot * _direction(heading)) / dt
-            return compute_facing(heading, velocity, look, float(np.hypot(*missing)) / dt)
+            speed = float(np.hypot(*missing)) / dt
+            return compute_facing(heading, velocity, look, speed, room)
         return np.zeros(2)
 
 

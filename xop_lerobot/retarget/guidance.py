@@ -16,6 +16,7 @@ from xop_lerobot.retarget.facing import FacingRule
 from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.retarget.horizon_goals import hold_near, preview
 from xop_lerobot.retarget.route import RoutePlanner
+from xop_lerobot.retarget.twist_room import TwistRoom
 from xop_lerobot.state import Goal
 from xop_lerobot.transforms import quat_from_yaw, quat_multiply
 
@@ -47,7 +48,13 @@ class Guidance:
     ) -> None:
         self._command_model = command_model
         self._facing = FacingRule(morphology, resting)
+        self._room = TwistRoom(morphology) if command_model.is_nonholonomic else None
         self._routes = RoutePlanner(morphology, resting, footprint)
+
+    def reset(self) -> None:
+        """Start anew."""
+        if self._room is not None:
+            self._room.reset()
 
     def lead(
         self,
@@ -56,6 +63,7 @@ class Guidance:
         poses: Mapping[str, np.ndarray],
         goal: Goal,
         config: MpcConfig,
+        time: float,
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Compute the goals at `compute_times`, and where a base on wheels shall face at the end.
 
@@ -65,6 +73,7 @@ class Guidance:
             poses: Pose of each tracked frame now. Shapes (7,).
             goal: The goal now.
             config: Parameters of the mode.
+            time: Time of `qpos` [s].
 
         Returns:
             Poses, shapes (H + 3, 7), and a direction in the world, as long as it counts: zero
@@ -73,15 +82,16 @@ class Guidance:
         times = compute_times(config)
         name = next((name for name in poses if name in goal.poses), None)
         drives = name is not None and self._drives(goal.mode)
+        room = self._room.compute(qpos, time) if drives and self._room is not None else math.inf
         if drives and _compute_speed(goal, name) < _STILL:
             twist = self._command_model.compute_twist(executed)
-            return self._lead_along_route(qpos, twist, poses, goal, name, times, config)
+            return self._lead_along_route(qpos, twist, poses, goal, name, times, config, room)
         near = hold_near(goal, poses, config.reach)
         goals = preview(near, tuple(poses), times, config.preview_s)
         if not drives:
             return goals, np.zeros(2)
         then = {each: track[-1:] for each, track in goals.items()}
-        return goals, self._facing.compute(qpos, poses, then, config.proposal_s)
+        return goals, self._facing.compute(qpos, poses, then, config.proposal_s, room)
 
     def _drives(self, mode: Mode) -> bool:
         """Whether wheels are among what may be moved in `mode`."""
@@ -99,6 +109,7 @@ class Guidance:
         name: str,
         times: np.ndarray,
         config: MpcConfig,
+        room: float,
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Goals where the base will have carried the frame `name`; the others go with it."""
         route = self._routes.plan(
@@ -109,6 +120,7 @@ class Guidance:
             goal.poses[name],
             duration=max(_LOOK_AHEAD, float(times[-2:].max())),
             turn_rate=float(goal.velocities[name][5]) if name in goal.velocities else 0.0,
+            room=room,
         )
         offsets, turns = route.offsets_at(times), quat_from_yaw(route.turns_at(times))
         goals = preview(goal, tuple(poses), times, config.preview_s)

@@ -206,6 +206,7 @@ class MpcRetargeter(Retargeter):
             self._rng = np.random.default_rng(self._seed)
             self._last = None
             self.candidates.reset()
+            self._guidance.reset()
             self.drift.reset()
             self.offset.reset(self.decision.join(state.command, state.arms))
             for planner in self._planners.values():
@@ -229,7 +230,7 @@ class MpcRetargeter(Retargeter):
         drift = self.drift.drift
         poses = self.readings.compute_poses(state.qpos, self.sites)
         goal = hold_level(goal, self._find_upright())
-        goals, facing = self._guidance.lead(state.qpos, executed, poses, goal, config)
+        goals, facing = self._guidance.lead(state.qpos, executed, poses, goal, config, state.time)
         then = {name: track[-1:] for name, track in goals.items()}
         proposal = self.candidates.propose(
             state,

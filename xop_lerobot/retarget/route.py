@@ -23,6 +23,7 @@ _BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
 _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
 _MAX_TWIST = 1.9  # largest twist of the waist in which the robot arrives [rad]
 _WAIST_LIMIT, _WAIST_SPEED = 2.2, 1.5  # of the waist that turns the head [rad], [rad/s]
+_ROOM_SPARE = 0.1  # by which a waist that waits for its base may be beyond what arms let it [rad]
 _RESTING, _TURNING = 0.15, 0.45  # yaw rates of a goal that rests and of one that turns [rad/s]
 _TURNING_TWIST = 0.6  # largest twist of the waist behind such a goal [rad]
 _TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
@@ -139,6 +140,7 @@ class RoutePlanner:
         goal: np.ndarray,
         duration: float,
         turn_rate: float = 0.0,
+        room: float = math.inf,
     ) -> Route:
         """Simulate the way.
 
@@ -151,6 +153,7 @@ class RoutePlanner:
             duration: Length of the way to look at [s].
             turn_rate: Yaw rate of the goal; behind one that turns the base does not wait until
                 the waist is at its limit [rad/s].
+            room: How far the arms let the waist twist [rad].
         """
         heading = float(quat_yaw(qpos[3:7]))
         x = float(qpos[0]) + self._pivot * math.cos(heading)
@@ -162,7 +165,7 @@ class RoutePlanner:
         else:
             carried = (self._resting[name] - self._pivot, 0.0)
             turning = min(max((abs(turn_rate) - _RESTING) / (_TURNING - _RESTING), 0.0), 1.0)
-            twist = _MAX_TWIST + turning * (_TURNING_TWIST - _MAX_TWIST)
+            twist = min(_MAX_TWIST + turning * (_TURNING_TWIST - _MAX_TWIST), room)
             aim = _Aim(gx, gy, float(quat_yaw(goal[3:])), twist, carried)
         count = math.ceil(duration / _DT) + 1
         way = _simulate(aim, x, y, heading, speeds, count)
@@ -179,7 +182,8 @@ class RoutePlanner:
         share = min(max(share, 0.0), 1.0)
         turns = np.zeros(count)
         if name not in self._hands:
-            turns = _unwind(float(quat_yaw(pose[3:])) - heading, aim.look, way[:, 2])
+            limit = min(_WAIST_LIMIT, room + _ROOM_SPARE)
+            turns = _unwind(float(quat_yaw(pose[3:])) - heading, aim.look, way[:, 2], limit)
         return Route(np.arange(count) * _DT, offsets, way[:, 2], turns, share)
 
     def _find_free(self, way: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:
@@ -227,17 +231,17 @@ def _simulate(
     return way
 
 
-def _unwind(twist: float, look: float, headings: np.ndarray) -> np.ndarray:
+def _unwind(twist: float, look: float, headings: np.ndarray, limit: float) -> np.ndarray:
     """Turns of the head from where its goal looks, as the waist gets there by its front [rad].
 
     A waist at its limit on one side, whose goal is just beyond that of the other, has to go all
     the way back; the shortest turn of the head is barred. Shape (n,).
     """
-    twist, turns = _clamp(_wrap(twist), _WAIST_LIMIT), np.empty(len(headings))
+    twist, turns = _clamp(_wrap(twist), limit), np.empty(len(headings))
     for i, heading in enumerate(headings):
         wanted = _wrap(look - heading)
-        if abs(wanted) > _WAIST_LIMIT:  # out of reach on either side: wait on this one
-            wanted = math.copysign(_WAIST_LIMIT, twist)
+        if abs(wanted) > limit:  # out of reach on either side: wait on this one
+            wanted = math.copysign(limit, twist)
         if i:
             twist += _clamp(wanted - twist, _WAIST_SPEED * _DT)
         turns[i] = _wrap(heading + twist - look)

@@ -11,7 +11,7 @@ import numpy as np
 from xop_lerobot.operator.view import SeenObject
 from xop_lerobot.tasks import furniture
 from xop_lerobot.tasks.hold import Hold
-from xop_lerobot.tasks.layout import make_direction, measure_pad, measure_reach
+from xop_lerobot.tasks.layout import find_palms, make_direction, measure_pad, measure_reach
 from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
 from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
 from xop_lerobot.transforms import make_pose, quat_conjugate, quat_from_yaw, quat_rotate
@@ -89,6 +89,8 @@ class BoxPickAndPlace(Task):
     def __init__(self, morphology: Morphology) -> None:
         super().__init__(morphology)
         self.reach, self.pad = measure_reach(morphology), measure_pad(morphology)
+        model = morphology.build_spec("full").compile()
+        self._palms = tuple(find_palms(morphology, model).values())
         self._lifted, self._placed = Hold(LIFTED_S), Hold(PLACED_S)
 
     @property
@@ -125,6 +127,7 @@ class BoxPickAndPlace(Task):
         geom.mass, geom.condim, geom.priority = BOX_MASS, 4, 1
         geom.solref = COMPLIANCE
         geom.conaffinity = furniture.OBJECT_CONTACT["conaffinity"]
+        furniture.add_grip(spec, geom, self._palms, BOX_FRICTION, COMPLIANCE)
         tape = (0.02, BOX[1] - SEEN + 0.0005, BOX[2] + 0.0005)
         furniture.add_look(box, "box_tape", "box", tape, (0, 0, 0), TAPE)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
 PARKING = (30.0, 30.0)
 """Where everything stands until it is placed, far from any robot [m]."""
+
+SHORTEST_STEPS = 2
+"""The shortest time constant of a contact, in steps of the simulation."""
 
 SLIDING, TORSION, ROLLING = 0.6, 0.005, 0.0001
 """Friction of furniture: lacquered wood; MuJoCo's defaults in torsion and rolling."""
@@ -92,6 +96,50 @@ def add_look(
     geom.contype = geom.conaffinity = 0
     geom.mass = 0
     return geom
+
+
+def add_grip(
+    spec: mujoco.MjSpec,
+    geom: mujoco.MjsGeom,
+    sites: Iterable[str],
+    friction: tuple[float, float, float],
+    compliance: tuple[float, float],
+) -> None:
+    r"""Let hands hold a solid without its creeping out of them, however soft it is.
+
+    MuJoCo's contacts prescribe :math:`J\dot v = -bv` for what slides in them, without
+    :math:`\dot J v`: a thing that is carried round at ω slides outwards at :math:`\omega^2 r/b`,
+    however hard it is held. With the time constant of a soft contact that is a centimetre a second.
+    So the friction of hands has a time constant of its own, the shortest that MuJoCo takes.
+
+    Args:
+        spec: The model.
+        geom: The solid.
+        sites: One on each hand; the hand is the body that carries it, and what hangs on that.
+        friction: Sliding, torsional [m], rolling [m].
+        compliance: Time constant [s] and damping ratio across the contact.
+
+    References:
+        MuJoCo's documentation, Computation, "Constraint model" (reference acceleration), and
+        XML reference, contact/pair, ``solreffriction``.
+    """
+    import mujoco  # noqa: PLC0415
+
+    sliding, torsion, rolling = friction
+    for site in sites:
+        hand = next(each for each in spec.sites if each.name == site).parent
+        for i, part in enumerate(hand.find_all(mujoco.mjtObj.mjOBJ_GEOM)):
+            if not part.contype:
+                continue
+            part.name = part.name or f"{hand.name}_part_{i}"
+            spec.add_pair(
+                geomname1=geom.name,
+                geomname2=part.name,
+                condim=geom.condim,
+                friction=[sliding, sliding, torsion, rolling, rolling],
+                solref=compliance,
+                solreffriction=(SHORTEST_STEPS * spec.option.timestep, 1.0),
+            )
 
 
 OBJECT_CONTACT = {"contype": OBJECT_BIT, "conaffinity": FLOOR_BIT | OBJECT_BIT}

@@ -41,7 +41,7 @@ OUT_OF_REACH = 0.06
 """Palms that stay so far beside their places are out of reach [m]."""
 LIFT = 0.06
 """How high the box is lifted [m]."""
-LIFTED = 0.037
+LIFTED = 0.045
 """Rise from which the person is sure to have lifted it [m]."""
 LIFTS = 3
 """How often a person lifts on, if the robot's arms come up less than the own."""
