@@ -1,11 +1,13 @@
 """Measure how old a headset's frame is when it is read, and when its command is there.
 
     python scripts/benchmark_headset.py --seconds 30
+    python scripts/benchmark_headset.py --sender browser --retargeter mpc
 
-A page in a process of its own sends frames over loopback, with the stamps of the clock that all
-processes of a machine share, engages by the gesture and drives a simulated robot in real time. To
-the command, the wait for the next tick of the control loop is part of the delay: half a period on
-average.
+A sender in a process of its own sends frames over loopback, with the stamps of the clock that all
+processes of a machine share, engages by the gesture and drives a simulated robot in real time. It
+is a program that behaves like the page, or the page itself in headless Chromium, with an emulated
+headset. To the command, the wait for the next tick of the control loop is part of the delay: half a
+period on average.
 """
 
 from __future__ import annotations
@@ -16,13 +18,16 @@ import math
 import multiprocessing
 import os
 import socket
+import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 CODE = "BENCHMARK"
+SPAWN = multiprocessing.get_context("spawn")
 OPEN_S, GESTURE_S = 1.2, 2.0
 """Hands are open at first, then the gesture is held."""
 LEVEL, TURNED = [0.0, 0, 0, 1], [0.0, 0, 1, 0]
@@ -66,6 +71,36 @@ def send_frames(port: int, seconds: float, rate: float) -> None:
                     ws.send(json.dumps(pong))
                 wait = begun + number / rate - time.monotonic()
             ws.send(json.dumps(make_message(number, time.monotonic() - begun)))
+
+
+def send_from_browser(port: int, seconds: float, rate: float, origin: Any) -> None:
+    """Be a headset in Chromium, which has its own rate; `origin` is when its clock began [s]."""
+    del rate
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+    import headset
+    from browser import launch
+
+    with launch() as browser:
+        page = browser.new_page(viewport={"width": 480, "height": 320})
+        headset.install(page)
+        page.goto(f"http://localhost:{port}/?code={CODE}")
+        # Chromium's clock is the machine's, from an origin that it tells by the time of day.
+        time_of_day = time.time() - time.monotonic()
+        origin.value = page.evaluate("performance.timeOrigin") / 1e3 - time_of_day
+        page.evaluate("wearer.embody()")
+        page.wait_for_function("() => wearer.pose !== null")
+        page.wait_for_selector("#headset:not([hidden])")
+        page.click("#headset")
+        page.wait_for_timeout(1000 * OPEN_S)
+        page.evaluate("wearer.person.hold('engage')")
+        page.wait_for_timeout(1000 * GESTURE_S)
+        page.evaluate("wearer.person.release('engage')")
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            for key in ("down", "up"):
+                page.evaluate(f"wearer.person.hold('{key}')")
+                page.wait_for_timeout(1000)
+                page.evaluate(f"wearer.person.release('{key}')")
 
 
 class Delays:
@@ -114,8 +149,13 @@ def measure_parsing(delays: Delays) -> None:
         delays.parse_work.append(time.thread_time() - begun)
 
 
-def add_device(delays: Delays) -> None:
-    """Register the device `measured`: a WebXR page whose frames are timed."""
+def add_device(delays: Delays, origin: Any) -> None:
+    """Register the device `measured`: a WebXR page whose frames are timed.
+
+    Args:
+        delays: Where they are noted.
+        origin: When the sender's clock began, on this machine's [s].
+    """
     from xop_lerobot.operator.devices import DEVICES
     from xop_lerobot.operator.devices.webxr import WebXrDevice
     from xop_lerobot.operator.frame import OperatorFrame
@@ -127,14 +167,15 @@ def add_device(delays: Delays) -> None:
             delays.judge_work.append(time.thread_time() - begun)
             newest = self._newest
             if newest is not None and newest is not before and source_time is not None:
-                delays.sent[newest.time] = source_time
-                delays.frame.append(time.monotonic() - source_time)
+                sent = source_time + origin.value
+                delays.sent[newest.time] = sent
+                delays.frame.append(time.monotonic() - sent)
 
     DEVICES.add("measured", Measured)
 
 
-def drive(settings: argparse.Namespace, delays: Delays) -> None:
-    """Let the page drive the robot in real time until it is gone."""
+def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
+    """Let the sender drive the robot in real time until it is gone."""
     from xop_lerobot.link import RobotInfo
     from xop_lerobot.low_level.policy import make_policy
     from xop_lerobot.morphology.morphology import make_morphology
@@ -160,8 +201,11 @@ def drive(settings: argparse.Namespace, delays: Delays) -> None:
     teleoperation.connect()
     loop.reset(seed=0, settle_s=0.8)
     device: Any = teleoperation.device
-    arguments = (port, settings.seconds, settings.rate)
-    page = multiprocessing.get_context("spawn").Process(target=send_frames, args=arguments)
+    arguments: tuple[Any, ...] = (port, settings.seconds, settings.rate)
+    send = send_frames
+    if settings.sender == "browser":
+        send, arguments = send_from_browser, (*arguments, origin)
+    page = SPAWN.Process(target=send, args=arguments)
     page.start()
     due = time.monotonic()
     while page.is_alive():
@@ -189,16 +233,18 @@ def main() -> None:
     parser.add_argument("--robot", choices=list(POLICIES), default="g1")
     parser.add_argument("--retargeter", choices=["direct", "mpc"], default="direct")
     parser.add_argument("--fps", type=int, default=25, help="rate of the control loop [Hz]")
-    parser.add_argument("--rate", type=float, default=72.0, help="frames of the headset [Hz]")
+    parser.add_argument("--sender", choices=["program", "browser"], default="program")
+    parser.add_argument("--rate", type=float, default=72.0, help="frames of the program [Hz]")
     parser.add_argument("--seconds", type=float, default=20.0)
     settings = parser.parse_args()
-    delays = Delays()
-    add_device(delays)
-    drive(settings, delays)
+    delays, origin = Delays(), SPAWN.Value("d", 0.0)
+    add_device(delays, origin)
+    drive(settings, delays, origin)
     measure_parsing(delays)
+    rate = f"{settings.rate:g} Hz" if settings.sender == "program" else "the browser's rate"
     print(
         f"{settings.robot}, {settings.retargeter}, loop at {settings.fps} Hz, frames at "
-        f"{settings.rate:g} Hz, {len(delays.command)} ticks engaged, "
+        f"{rate}, {len(delays.command)} ticks engaged, "
         f"{delays.late_ticks} ticks late, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
     )
     delays.print()

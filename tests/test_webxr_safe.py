@@ -5,17 +5,21 @@ from __future__ import annotations
 import contextlib
 import datetime
 import http.client
+import shutil
 import socket
 import ssl
 import stat
+import subprocess
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import headset
 import numpy as np
 import pytest
 from avp_server import wait_for
+from browser import launch
 from cryptography import x509
 from swaying import make_person
 from test_webxr import send
@@ -314,6 +318,43 @@ def test_tls(tmp_path, monkeypatch):
         frame = device.read(0.0)
         assert frame is not None and frame.tracked.all()
         page.close()
+    finally:
+        device.disconnect()
+
+
+def test_a_browser_trusts_it_once_it_is_installed(tmp_path, monkeypatch):
+    """As a headset's: refused at first; after /cert was installed the page is secure and drives."""
+    certutil = shutil.which("certutil")
+    if certutil is None:
+        pytest.skip("needs certutil to install a certificate: apt-get install libnss3-tools")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    store = f"sql:{tmp_path}/.pki/nssdb"
+    (tmp_path / ".pki/nssdb").mkdir(parents=True)
+    subprocess.run([certutil, "-N", "-d", store, "--empty-password"], check=True)
+    device = make_device(DeviceConfig(type="webxr", port=find_port(), code=CODE, tls=True))
+    assert isinstance(device, WebXrDevice)
+    device.connect()
+    address = f"https://localhost:{device.port}/?code={CODE}"
+    monkeypatch.setenv("HOME", str(tmp_path))  # where Chromium looks for what its user trusts
+    try:
+        assert device.certificate is not None
+        with launch() as browser:
+            page = browser.new_page()
+            with pytest.raises(Exception, match="ERR_CERT_AUTHORITY_INVALID"):
+                page.goto(address)
+        subprocess.run(
+            [certutil, "-A", "-d", store, "-n", "xop", "-t", "CP,,", "-i", device.certificate.path],
+            check=True,
+        )
+        with launch() as browser:
+            page = browser.new_page()
+            headset.install(page)
+            page.goto(address)
+            assert page.evaluate("isSecureContext && location.protocol") == "https:"
+            page.evaluate("wearer.embody()")
+            page.wait_for_function("() => wearer.pose !== null")
+            page.click("#headset")
+            wait_for(lambda: (frame := device.read(0.0)) and frame.tracked.all())
     finally:
         device.disconnect()
 
