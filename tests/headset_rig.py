@@ -6,6 +6,7 @@ so that every run is the same however slow the machine is.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -28,6 +29,8 @@ from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
 FPS, RATE = 25, 50
+RETARGETER = os.environ.get("XOP_TEST_RETARGETER", "direct")
+"""`mpc` takes minutes for what takes seconds; it is run by hand."""
 UP = quat_exp(np.array([np.pi, 0, 0]))
 
 M = TypeVar("M")
@@ -67,9 +70,8 @@ class Rig:
         plant = Simulation(morphology, SimulationConfig(), kind="planning")
         self.loop = PolicyLoop(morphology, plant, make_policy(POLICIES[name]))
         info = RobotInfo(f"xop_{name}", morphology, POLICIES[name], None, "empty", FPS, 0)
-        self.teleop = Teleoperation(
-            TeleoperationConfig(device=config, retargeter=RetargeterConfig(type="direct")), info
-        )
+        retargeter = RetargeterConfig(type=RETARGETER)
+        self.teleop = Teleoperation(TeleoperationConfig(device=config, retargeter=retargeter), info)
         device = self.teleop.device
         assert isinstance(device, LiveDevice)
         self.device = device

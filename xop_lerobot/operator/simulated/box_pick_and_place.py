@@ -42,9 +42,9 @@ APPROACHES = 4
 FARTHER = 0.055
 """So much farther than for a touch the person stands from a box, to have elbows and waist free [m,
 robot]."""
-APART, NEARER = 0.12, 0.12
-"""So much farther apart and nearer to oneself than else the hands are when one walks up to a box,
-not to sweep it off its support [m]."""
+APART = 0.20
+"""So much farther apart than else the hands are when one walks up to a box, not to sweep it off its
+support in a turn [m]."""
 STAND_NEAR = 0.04
 """How far beside where it wants to stand before the box is good enough [m]."""
 GRASPS = 4
@@ -112,7 +112,6 @@ def walk_to_box(mind: Mind) -> Doing:
         yield from glance(mind, "spot")
         hands = relaxed_hands(mind.person.size)
         hands[:, 1] += [APART, -APART]
-        hands[:, 0] -= NEARER
         yield from go_to(mind, place, hands=hands, tolerance=STAND_NEAR)
     yield from set_mode(mind, Mode.STATIONARY)
 
