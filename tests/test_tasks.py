@@ -12,7 +12,13 @@ from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.tasks import box_pick_and_place as box_task
 from xop_lerobot.tasks import dual_point_touch as touch
 from xop_lerobot.tasks.hold import Hold
-from xop_lerobot.tasks.layout import find_room, make_direction, measure_reach
+from xop_lerobot.tasks.layout import (
+    DRAW_IN,
+    find_room,
+    make_direction,
+    measure_draw_in,
+    measure_reach,
+)
 from xop_lerobot.tasks.stage import Stage
 from xop_lerobot.tasks.touching import Touching, compute_tilt
 from xop_lerobot.transforms import make_pose, quat_from_rpy
@@ -267,3 +273,9 @@ def test_hands_that_do_not_press_lift_nothing():
     grasp.take(hold_s=1.0)
     assert not grasp.stage.status.picked_up
     assert grasp.stage.status.figures["lift_m"] < 0.005
+
+
+def test_how_far_hands_can_be_drawn_in():
+    """G1's elbows rest as bent as they may be (`arm_limits`); RB-Y1's do not."""
+    assert measure_draw_in(make_morphology("g1")) == 0
+    assert measure_draw_in(make_morphology("rby1")) == pytest.approx(DRAW_IN)

@@ -11,7 +11,13 @@ import numpy as np
 from xop_lerobot.operator.view import SeenObject
 from xop_lerobot.tasks import furniture
 from xop_lerobot.tasks.hold import Hold
-from xop_lerobot.tasks.layout import find_palms, make_direction, measure_pad, measure_reach
+from xop_lerobot.tasks.layout import (
+    find_palms,
+    make_direction,
+    measure_draw_in,
+    measure_pad,
+    measure_reach,
+)
 from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
 from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
 from xop_lerobot.transforms import make_pose, quat_conjugate, quat_from_yaw, quat_rotate
@@ -91,6 +97,7 @@ class BoxPickAndPlace(Task):
         self.reach, self.pad = measure_reach(morphology), measure_pad(morphology)
         model = morphology.build_spec("full").compile()
         self._palms = tuple(find_palms(morphology, model).values())
+        self._draw_in = measure_draw_in(morphology)
         self._lifted, self._placed = Hold(LIFTED_S), Hold(PLACED_S)
 
     @property
@@ -101,11 +108,13 @@ class BoxPickAndPlace(Task):
           far as possible, but the arms, which are thicker than the hands, must not touch it.
         - `palm_outside`: a palm's site is so far outside of the box's side when the hand touches.
         - `press`: wrist goals go so far further in, which presses the box.
+        - `draw_in`: so far the hands may be drawn in while one walks up to it.
         """
         return {
             "palm_forward": min(-self.pad.forward, -self.pad.wrist_end - BOX[0] - WRIST_GAP),
             "palm_outside": self.pad.depth,
             "press": PRESS.get(self.morphology.name, 0.05),
+            "draw_in": self._draw_in,
         }
 
     def add_to(self, spec: mujoco.MjSpec) -> None:

@@ -9,6 +9,13 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.arm_ik import ArmIk
+from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.transforms import make_pose, pose_multiply
+
+DRAW_IN = 0.12
+"""Farther than this nobody draws in hands [m]."""
+_STEPS, _DT, _NEAR = 50, 0.04, 0.005
 
 
 @dataclass(frozen=True)
@@ -87,6 +94,37 @@ def find_room(model: mujoco.MjModel) -> np.ndarray | None:
             [front[0] - front_half[0], left[1] - left_half[1]],
         ]
     )
+
+
+def measure_draw_in(morphology: Morphology) -> float:
+    """Measure how far the wrists can be drawn in towards the body from where they are at rest [m].
+
+    Some arms rest with their elbows as bent as they may be. At most `DRAW_IN`, in three steps.
+    """
+    ik = ArmIk(morphology)
+    sites = {arm.frame: morphology.frames[arm.frame] for arm in morphology.arms}
+    kinematics = SiteKinematics(ik.model, tuple(sites.values()))
+    qpos = morphology.standing_qpos()
+    joints = [joint for arm in morphology.arms for joint in arm.joints]
+    angles = np.array([morphology.arm_rest.get(joint, 0.0) for joint in joints])
+
+    def find_wrists() -> dict[str, np.ndarray]:
+        posture = qpos.copy()
+        posture[ik.qpos_address] = angles
+        poses = kinematics.compute_poses(posture)
+        return {name: poses[site] for name, site in sites.items()}
+
+    rest, drawn_in = find_wrists(), 0.0
+    for way in DRAW_IN * np.array([1, 2, 3]) / 3:
+        back = make_pose(np.array([-way, 0, 0]), [1.0, 0, 0, 0])
+        goals = {name: pose_multiply(back, pose) for name, pose in rest.items()}
+        for _ in range(_STEPS):
+            angles = ik.solve(qpos, angles, goals, _DT)
+        reached = find_wrists()
+        if max(math.dist(reached[n][:3], goals[n][:3]) for n in goals) > _NEAR:
+            break
+        drawn_in = float(way)
+    return drawn_in
 
 
 @dataclass(frozen=True)

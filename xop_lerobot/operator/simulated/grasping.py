@@ -37,8 +37,8 @@ ROBOT_LAG = 0.35
 """How much later than oneself a robot is known to move [s]."""
 PRESS = 0.03
 """Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
-OUT_OF_REACH = 0.06
-"""Palms that stay so far beside their places are out of reach [m]."""
+OUT_OF_REACH, FALL_SHORT = 0.06, 0.03
+"""Palms that stay so far beside their places are out of reach, or so far before them [m]."""
 LIFT = 0.06
 """How high the box is lifted [m]."""
 LIFTED = 0.045
@@ -56,7 +56,15 @@ CARRY_SPEED = 0.06
 
 
 class OutOfReach(Exception):
-    """The hands do not come to where they should be; the person has to stand elsewhere."""
+    """The hands do not come to where they should be; the person has to stand elsewhere.
+
+    Attributes:
+        short: How far before their places they stay; negative: beyond [m].
+    """
+
+    def __init__(self, short: float) -> None:
+        super().__init__()
+        self.short = short
 
 
 class Slipped(Exception):
@@ -107,8 +115,15 @@ def compute_flat(mind: Mind, side: str) -> np.ndarray:
     return quat_from_matrix(np.column_stack([ahead, np.cross(outwards, ahead), outwards]))
 
 
-def bring_beside(mind: Mind) -> Doing:
-    """Bring both palms to the sides of the box, from the near side and outside."""
+def bring_beside(mind: Mind) -> Generator[None, None, tuple[float, float]]:
+    """Bring both palms to the sides of the box, from the near side and outside.
+
+    Returns:
+        How far they are seen beside their places, and how far before them [m].
+
+    Raises:
+        OutOfReach: If they do not come there.
+    """
     for before, tries in ((0.15, 1), (0.0, mind.person.corrections)):
         sides = compute_sides(mind, BESIDE + (0.03 if before else 0.0), before)
         wrists = {}
@@ -127,8 +142,11 @@ def bring_beside(mind: Mind) -> Doing:
             if worst <= BESIDE_TOLERANCE or before:
                 break
             yield from nudge(mind, errors)
-        if worst > OUT_OF_REACH and not before:
-            raise OutOfReach
+        ahead = compute_ahead(compute_heading(mind.eyes.pose("head")[3:]))
+        short = float(np.mean([error @ ahead for error in errors.values()]))
+        if (worst > OUT_OF_REACH or short > FALL_SHORT) and not before:
+            raise OutOfReach(short)
+    return worst, short
 
 
 def close(mind: Mind, press: float) -> Doing:
@@ -216,7 +234,7 @@ def lift(mind: Mind, rest: float) -> Generator[None, None, tuple[float, float]]:
     before, lifted = _see_hands(mind), 0.0
     for _ in range(LIFTS):
         mind.note("lift")
-        step = LIFT - max(0.0, _see_hands(mind) - before)
+        step = max(LIFT - max(0.0, _see_hands(mind) - before), LIFT / 3)
         yield from shift_hands(mind, np.array([0, 0, step]), CARRY_SPEED)
         yield from mind.settle()
         lifted += step
