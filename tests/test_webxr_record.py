@@ -20,6 +20,7 @@ from typing import Any
 import headset
 import numpy as np
 import pytest
+from headset_rig import RETARGETER
 from lerobot.datasets import LeRobotDataset
 
 from xop_lerobot.dataset.facts import read_facts
@@ -150,7 +151,10 @@ def test_from_engage_to_save(tmp_path):
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     root = tmp_path / "webxr"
-    with launch() as browser, record(root, port, "--teleop.retargeter.type=direct") as process:
+    with (
+        launch() as browser,
+        record(root, port, f"--teleop.retargeter.type={RETARGETER}") as process,
+    ):
         wait_for(lambda: listens(port), process, "the page")
         page = open_headset(browser, port)
         drive(page)
@@ -165,6 +169,7 @@ def check(root: Path) -> None:
     dataset = LeRobotDataset("local/webxr", root=root)
     assert dataset.num_episodes == 1  # `stop` saved it, and no second one began
     (facts,) = read_facts(root)
+    print(f"{RETARGETER}: {facts['real_fps']:.1f} frames a second, {facts['length']} frames")
     assert facts["success"]
     assert not facts["fallen"]
     columns = dataset.hf_dataset.with_format("numpy")
