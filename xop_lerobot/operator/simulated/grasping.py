@@ -41,7 +41,7 @@ OUT_OF_REACH, FALL_SHORT = 0.06, 0.03
 """Palms that stay so far beside their places are out of reach, or so far before them [m]."""
 LIFT = 0.06
 """How high the box is lifted [m]."""
-LIFTED = 0.045
+LIFTED = 0.037
 """Rise from which the person is sure to have lifted it [m]."""
 LIFTS = 3
 """How often a person lifts on, if the robot's arms come up less than the own."""
@@ -234,7 +234,7 @@ def lift(mind: Mind, rest: float) -> Generator[None, None, tuple[float, float]]:
     before, lifted = _see_hands(mind), 0.0
     for _ in range(LIFTS):
         mind.note("lift")
-        step = max(LIFT - max(0.0, _see_hands(mind) - before), LIFT / 3)
+        step = LIFT - max(0.0, _see_hands(mind) - before)
         yield from shift_hands(mind, np.array([0, 0, step]), CARRY_SPEED)
         yield from mind.settle()
         lifted += step
