@@ -18,6 +18,8 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 def launch() -> Iterator[Any]:
     """Start Chromium, or skip."""
     reason = "needs Playwright: pip install playwright"
+    if hasattr(os, "sched_setscheduler"):  # what an encoder in this process may have changed
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     api = pytest.importorskip("playwright.sync_api", reason=reason)
     with api.sync_playwright() as playwright:
         path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)

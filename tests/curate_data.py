@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDataset
 
 from xop_lerobot.dataset.curate.synthetic import make_dataset
+from xop_lerobot.dataset.schedule import keep_schedule
 
 SIZE = 32
 
@@ -53,7 +54,8 @@ def make_foreign(root: Path, episodes: int = 2, frames: int = 30, *, video: bool
             if video:
                 row["observation.images.cam"] = rng.integers(0, 255, (SIZE, SIZE, 3), np.uint8)
             dataset.add_frame(row)
-        dataset.save_episode()
+        with keep_schedule():
+            dataset.save_episode()
     dataset.finalize()
     return root
 

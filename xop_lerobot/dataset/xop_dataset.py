@@ -33,6 +33,7 @@ from xop_lerobot.dataset.facts import (
     read_versions,
     write_config,
 )
+from xop_lerobot.dataset.schedule import keep_schedule
 from xop_lerobot.dataset.shutdown import hold_signals
 from xop_lerobot.dataset.tally import Tally
 from xop_lerobot.dataset.video_queue import VideoQueue
@@ -286,7 +287,7 @@ class XopDataset(LeRobotDataset):
             )
         length = self._tally.frames
         self._write_mark(episode_data)
-        with hold_signals(), skip_embedding(self):
+        with hold_signals(), skip_embedding(self), keep_schedule():
             super().save_episode(episode_data, parallel_encoding)
             self._own_root = False
             self._secure()
