@@ -45,12 +45,8 @@ robot]."""
 APART = 0.12
 """So much farther apart than else the hands are when one walks up to a box [m]. They are drawn in,
 too, as far as the robot's arms allow, not to sweep it off its support in a turn."""
-STEP_NEARER = (-0.04, 0.04)
-"""How much nearer, at the most, a person stands when hands stay before their places [m]."""
 STAND_NEAR = 0.04
 """How far beside where it wants to stand before the box is good enough [m]."""
-FAR_BESIDE = 0.04
-"""Palms that were so far beside their places when they closed are why a grasp has failed [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""
 HOLD_S = 3.6
@@ -79,21 +75,15 @@ fast [rad/s]."""
 def carry_box(mind: Mind) -> Doing:
     """Take the box from its support to the spot on the table; who loses it takes it again."""
     yield from find(mind, "box")
-    farther = FARTHER
     for attempt in range(APPROACHES):
         try:
-            yield from walk_to_box(mind, farther)
-            yield from pick_up(mind, farther, attempt * PRESS_MORE)
+            yield from walk_to_box(mind)
+            yield from pick_up(mind, attempt * PRESS_MORE)
             yield from walk_to_table(mind)
             yield from put_down(mind)
             return
-        except OutOfReach as miss:
-            mind.note(f"the hands stay {100 * miss.short:.0f} cm before their places")
-            farther -= float(np.clip(miss.short, *STEP_NEARER)) or STEP_NEARER[1] / 2
-            # Upright, one sees how far that is to walk.
-            upright = replace(mind.body.posture, drop=0.0, lean=np.zeros(2), look=np.zeros(2))
-            yield from take_posture(mind, upright)
-            yield from mind.settle()
+        except OutOfReach:
+            mind.note("the hands do not get there")
         except Slipped:
             mind.note("the box slipped out")
             yield from open_hands(mind)
@@ -109,12 +99,12 @@ def choose_heading(mind: Mind, name: str) -> float:
     return float(sides[np.argmin(np.abs(wrap_angle(sides - course)))])
 
 
-def walk_to_box(mind: Mind, farther: float = FARTHER) -> Doing:
-    """Stand before the box, squarely, so much farther than for a touch [m]."""
+def walk_to_box(mind: Mind) -> Doing:
+    """Stand before the box, squarely."""
     heading = choose_heading(mind, "box")
     box = mind.eyes.pose("box")[:3]
     ahead = compute_ahead(heading)
-    distance = compute_distance(mind, [box]) + farther
+    distance = compute_distance(mind, [box]) + FARTHER
     place = np.array([*(box - distance * ahead)[:2], heading])
     miss, turn = compute_miss(mind, place)
     if miss > STAND_NEAR or abs(turn) > mind.person.heading_tolerance:
@@ -127,20 +117,19 @@ def walk_to_box(mind: Mind, farther: float = FARTHER) -> Doing:
     yield from set_mode(mind, Mode.STATIONARY)
 
 
-def pick_up(mind: Mind, farther: float = FARTHER, harder: float = 0.0) -> Doing:
+def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
     """Take hold of the box, lift it and hold it; who fails presses harder.
 
     Args:
         mind: Who does.
-        farther: How much farther than for a touch the person stands [m].
         harder: How much more than is known to be enough the hands press [m].
     """
     box = mind.eyes.pose("box")[:3]
     yield from take_posture(mind, plan_posture(mind, [box]))
-    yield from keep_distance(mind, farther)
+    yield from keep_distance(mind)
     press = mind.eyes.recall("press", PRESS)
     for attempt in range(GRASPS):
-        beside, short = yield from bring_beside(mind)
+        yield from bring_beside(mind)
         rest = float(mind.eyes.pose("box")[2])
         yield from close(mind, press + harder + attempt * PRESS_MORE)
         rise, lifted = yield from lift(mind, rest)
@@ -150,16 +139,14 @@ def pick_up(mind: Mind, farther: float = FARTHER, harder: float = 0.0) -> Doing:
             return
         yield from shift_hands(mind, np.array([0, 0, -lifted]), CARRY_SPEED)
         yield from open_hands(mind)
-        if beside > FAR_BESIDE:
-            raise OutOfReach(max(short, 0.0))
     raise GaveUp("the box slips out of the hands")
 
 
-def keep_distance(mind: Mind, farther: float) -> Doing:
+def keep_distance(mind: Mind) -> Doing:
     """Lean back, or ahead, to have the box at the distance at which arms work well."""
     head, box = mind.eyes.pose("head"), mind.eyes.pose("box")
     ahead = compute_ahead(compute_heading(head[3:]))
-    error = float((box - head)[:3] @ ahead) - compute_reach(mind) - farther
+    error = float((box - head)[:3] @ ahead) - compute_reach(mind) - FARTHER
     mind.note(f"box {100 * error:.0f} cm too far")
     if abs(error) > 0.5 * STAND_NEAR:
         yield from lean(mind, {"both": error * ahead})

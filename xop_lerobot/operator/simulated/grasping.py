@@ -37,8 +37,8 @@ ROBOT_LAG = 0.35
 """How much later than oneself a robot is known to move [s]."""
 PRESS = 0.03
 """Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
-OUT_OF_REACH, FALL_SHORT = 0.06, 0.03
-"""Palms that stay so far beside their places are out of reach, or so far before them [m]."""
+OUT_OF_REACH = 0.06
+"""Palms that stay so far beside their places are out of reach [m]."""
 LIFT = 0.06
 """How high the box is lifted [m]."""
 LIFTED = 0.037
@@ -56,15 +56,7 @@ CARRY_SPEED = 0.06
 
 
 class OutOfReach(Exception):
-    """The hands do not come to where they should be; the person has to stand elsewhere.
-
-    Attributes:
-        short: How far before their places they stay; negative: beyond [m].
-    """
-
-    def __init__(self, short: float) -> None:
-        super().__init__()
-        self.short = short
+    """The hands do not come to where they should be; the person has to stand elsewhere."""
 
 
 class Slipped(Exception):
@@ -115,15 +107,8 @@ def compute_flat(mind: Mind, side: str) -> np.ndarray:
     return quat_from_matrix(np.column_stack([ahead, np.cross(outwards, ahead), outwards]))
 
 
-def bring_beside(mind: Mind) -> Generator[None, None, tuple[float, float]]:
-    """Bring both palms to the sides of the box, from the near side and outside.
-
-    Returns:
-        How far they are seen beside their places, and how far before them [m].
-
-    Raises:
-        OutOfReach: If they do not come there.
-    """
+def bring_beside(mind: Mind) -> Doing:
+    """Bring both palms to the sides of the box, from the near side and outside."""
     for before, tries in ((0.15, 1), (0.0, mind.person.corrections)):
         sides = compute_sides(mind, BESIDE + (0.03 if before else 0.0), before)
         wrists = {}
@@ -142,11 +127,8 @@ def bring_beside(mind: Mind) -> Generator[None, None, tuple[float, float]]:
             if worst <= BESIDE_TOLERANCE or before:
                 break
             yield from nudge(mind, errors)
-        ahead = compute_ahead(compute_heading(mind.eyes.pose("head")[3:]))
-        short = float(np.mean([error @ ahead for error in errors.values()]))
-        if (worst > OUT_OF_REACH or short > FALL_SHORT) and not before:
-            raise OutOfReach(short)
-    return worst, short
+        if worst > OUT_OF_REACH and not before:
+            raise OutOfReach
 
 
 def close(mind: Mind, press: float) -> Doing:
