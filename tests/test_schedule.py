@@ -47,3 +47,13 @@ def test_who_had_another_policy_keeps_it():
     with keep_schedule():
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     assert os.sched_getscheduler(0) == before
+
+
+def test_another_priority_within_the_policy_is_given_back():
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(5))
+    except PermissionError:
+        pytest.skip("only root may have real-time priorities")
+    with keep_schedule():
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(99))
+    assert os.sched_getparam(0).sched_priority == 5
