@@ -5,8 +5,10 @@ r"""Distil FALCON's G1 policy into the student that ships with the package.
 
 DAgger (Ross et al., 2011): many robots run in the planning model; each is driven by the teacher
 or by the student, the teacher's share falls from one to zero, and the student is trained on
-what the teacher would have done in every state that was met. Afterwards, and alone with
-``--evaluate-only``, student and teacher are compared on the same random sequences.
+what the teacher would have done in every state that was met. The teacher drives legs and waist
+as FALCON does; its arms bear their weight, computed from the model, since FALCON does so only in
+the postures that it was trained with. Afterwards, and alone with ``--evaluate-only``, student and
+FALCON are compared on the same random sequences.
 """
 
 from __future__ import annotations
@@ -23,16 +25,21 @@ import numpy as np
 import torch
 from torch import nn
 
+from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.comparison import compare_policies, replace_table, write_table
 from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
 from xop_lerobot.low_level.falcon import Falcon
 from xop_lerobot.low_level.falcon_observation import (
+    ACTION_SCALE,
+    ARMS,
     MEMORY_SIZE,
     NUM_JOINTS,
     OBSERVATION_SIZE,
     FalconLikePolicy,
+    compute_targets,
 )
+from xop_lerobot.low_level.policy import PolicyOutput
 from xop_lerobot.low_level.student import Student, load_weights, save_weights
 from xop_lerobot.low_level.trial import BatchSimulation
 from xop_lerobot.morphology.morphology import make_morphology
@@ -69,6 +76,53 @@ REFINE_AFTER = 3
 OUTPUT_WEIGHTS = np.ones(NUM_JOINTS)
 OUTPUT_WEIGHTS[13:15] = 0.1  # waist roll and pitch: only seen as a last action
 OUTPUT_WEIGHTS[15:] = 0.3  # arms: a small residual
+
+
+class Teacher(Falcon):
+    r"""FALCON, whose arms' part of the action bears the arms' weight.
+
+    The servos of the arms are soft. Their targets are offset by the torque of gravity over their
+    stiffness, :math:`\Delta q^* = \tau_g(q) / k_p`, from the planning model.
+
+    Args:
+        path: FALCON's ONNX file; None for the cached or downloaded one.
+    """
+
+    name = "teacher"
+
+    def __init__(self, path: str | None) -> None:
+        super().__init__(path)
+        self._model = build_model(make_morphology("g1"), "planning")
+        self._data = mujoco.MjData(self._model)
+        self._stiffness = self._model.actuator_gainprm[ARMS, 0]
+
+    def act(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        command: np.ndarray,
+        arms: np.ndarray,
+        memory: np.ndarray,
+        mode: Mode | np.ndarray,
+    ) -> PolicyOutput:
+        """Compute motor targets for the next 20 ms; see `LowLevelPolicy.act`."""
+        after = super().act(qpos, qvel, command, arms, memory, mode).memory
+        action = after[:, :NUM_JOINTS]
+        action[:, ARMS] = self._compute_offsets(qpos) / ACTION_SCALE
+        return PolicyOutput(compute_targets(action, command, arms), after)
+
+    def _compute_offsets(self, qpos: np.ndarray) -> np.ndarray:
+        """Offsets of the arms' targets [rad]. Shapes (n, 36) -> (n, 14)."""
+        model, data, force = self._model, self._data, np.zeros(self._model.nv)
+        offsets = np.empty((len(qpos), len(self._stiffness)))
+        for row, configuration in zip(offsets, qpos, strict=True):
+            data.qpos[:] = configuration
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+            mujoco.mj_rne(model, data, 0, force)  # at rest: gravity alone
+            row[:] = force[6:][ARMS] / self._stiffness
+        return offsets
 
 
 class Network(FalconLikePolicy):
@@ -261,7 +315,7 @@ def distill(arguments: argparse.Namespace) -> Network:
     generator = torch.Generator().manual_seed(arguments.seed)
     robots, steps = arguments.robots, arguments.steps
     experience = Experience(arguments.rounds * robots * steps)
-    collector = Collector(Falcon(arguments.teacher), robots, arguments.threads, rng)
+    collector = Collector(Teacher(arguments.teacher), robots, arguments.threads, rng)
     start = time.monotonic()
     refines = arguments.init is not None
     driver: FalconLikePolicy | None = Student(str(arguments.init)) if refines else None

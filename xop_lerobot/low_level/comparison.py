@@ -222,13 +222,15 @@ def write_table(report: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def replace_table(page: Path, table: str) -> None:
+def replace_table(page: Path, table: str, mark: str = "comparison") -> None:
     """Replace what stands between the two marks of a Markdown page by `table`.
+
+    The marks are the comments ``mark`` and ``end of mark``.
 
     Raises:
         BadValue: If the page does not have the marks.
     """
-    begin, end = "<!-- comparison -->\n", "<!-- end of comparison -->"
+    begin, end = f"<!-- {mark} -->\n", f"<!-- end of {mark} -->"
     text = page.read_text(encoding="utf-8")
     if text.count(begin) != 1 or text.count(end) != 1:
         raise BadValue(f"'{page}' must have one line {begin.strip()!r} and one {end!r}")

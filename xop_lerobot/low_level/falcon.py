@@ -9,6 +9,7 @@ from xop_lerobot.low_level.falcon_observation import (
     NUM_JOINTS,
     OBSERVATION_SIZE,
     FalconLikePolicy,
+    calm_arms,
 )
 from xop_lerobot.low_level.onnx_network import OnnxNetwork
 from xop_lerobot.low_level.policy import POLICIES
@@ -17,6 +18,9 @@ from xop_lerobot.low_level.policy_file import find_falcon_file
 
 class Falcon(FalconLikePolicy):
     """FALCON (Zhang et al., 2025): two networks, for legs and waist and for the arms' residual.
+
+    It is shown calm arms (`calm_arms`), without which it walks off, or falls, in most postures
+    at the ends of the arms' ranges.
 
     Args:
         path: Its ONNX file; None for the cached or downloaded one.
@@ -40,7 +44,7 @@ class Falcon(FalconLikePolicy):
 
     def infer(self, observation: np.ndarray) -> np.ndarray:
         """Run the network; see `FalconLikePolicy.infer`."""
-        return self._network(observation)
+        return self._network(calm_arms(observation))
 
 
 POLICIES.add("falcon", Falcon)

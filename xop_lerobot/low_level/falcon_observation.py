@@ -64,6 +64,9 @@ HISTORY = 5
 OBSERVATION_SIZE = FRAME_SIZE * HISTORY
 MEMORY_SIZE = NUM_JOINTS + OBSERVATION_SIZE
 
+MOVES = OBSERVATION_SIZE - FRAME_SIZE + 36
+"""Column of an observation that says whether the robot walks now."""
+
 ACTION_SCALE = 0.25
 ACTION_LIMIT = 100.0
 
@@ -95,6 +98,40 @@ UPPER_LIMITS = _read_only(
     + [2.6704, 1.5882, 2.618, 2.0944, 1.97222, 1.61443, 1.61443]
 )
 """Upper joint limits, to which targets are clipped [rad]. Shape (29,)."""
+
+
+CALM = (0.8, 0.3, 0.3, 0.8, 0.0, 0.3, 0.3)
+"""Part of each angle of an arm, shoulder to wrist, that FALCON is shown; see `calm_arms`."""
+
+
+def _make_calm_view() -> np.ndarray:
+    view = np.ones((HISTORY, FRAME_SIZE))
+    view[:, 40:69][:, ARMS] = view[:, 101:115] = CALM * 2
+    view = view.reshape(OBSERVATION_SIZE)
+    view.setflags(write=False)
+    return view
+
+
+CALM_VIEW = _make_calm_view()
+"""Factors that shrink the arms' angles and targets in an observation. Shape (575,)."""
+
+
+def calm_arms(observation: np.ndarray) -> np.ndarray:
+    """Show FALCON arms that are nearer to its default posture than they are.
+
+    It was trained on arm motions of people, and in postures at the ends of the joints' ranges it
+    walks off at a command of zero, or falls. The legs hardly need to know the arms' posture: what
+    it does to the balance they feel by the tilt of the base, as they feel a weight in the hands.
+    They are shown at `CALM` of their angles: most of what swings the arms fore and aft, less of
+    the rest. docs/low_level.md has the measurements.
+
+    Args:
+        observation: Observations. Shape (n, 575), float32.
+
+    Returns:
+        Shape (n, 575), float32.
+    """
+    return observation * CALM_VIEW.astype(np.float32)
 
 
 def compute_projected_gravity(quat: np.ndarray) -> np.ndarray:
