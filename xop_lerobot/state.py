@@ -43,6 +43,8 @@ class RobotState:
         fallen: Whether the robot has fallen.
         collision: Whether the robot touches anything but the ground under its feet or wheels.
         settled: Whether the robot stands still enough to engage.
+        trouble: What the robot does that it was not told to (`plant.watch`), in words; empty
+            while it does what it is told.
     """
 
     time: float
@@ -59,6 +61,7 @@ class RobotState:
     fallen: bool = False
     collision: bool = False
     settled: bool = True
+    trouble: str = ""
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from xop_lerobot.operator.raised_hands import HOLDING
 from xop_lerobot.operator.telling import list_warnings, tell_changes
 from xop_lerobot.operator.view import View
 from xop_lerobot.plant.policy_loop import limit_action
+from xop_lerobot.plant.watch import MOVES
 from xop_lerobot.retarget.arm_driver import ArmDriver
 from xop_lerobot.retarget.changes import Change, Settings, make_toggle, parse_change
 from xop_lerobot.retarget.config import RetargeterConfig
@@ -43,6 +44,9 @@ from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.retarget.smoothing import CommandSmoother
 from xop_lerobot.retarget.state_sync import StateSync, Synced
 from xop_lerobot.state import FRAMES, Goal, RobotState
+
+RETREAT_RATE = 1.0
+"""Speed at which arms in trouble go back to rest [rad/s]."""
 
 
 @dataclass
@@ -131,6 +135,7 @@ class Teleoperation:
         self._arms.forget()
         self._follower.forget()
         self._last_time: float | None = None
+        self._trouble = ""
         self._shown: Display | None = None
 
     def connect(self) -> None:
@@ -271,6 +276,7 @@ class Teleoperation:
         measured, (state, synced) = state, self._synchronise(state)
         poses = self._compute_frames(state)
         frame = self.device.read(state.time)
+        self._tell_trouble(state)
         frame = self._engagement.follow(state, frame, poses)
         mode = self._mode
         self._read_gestures(frame)
@@ -302,7 +308,9 @@ class Teleoperation:
             mode=self._mode,
             clutch=progress,
             holding=holding,
-            warnings=list_warnings(self.device, frame, engaged=engaged, plan_age=age),
+            warnings=list_warnings(
+                self.device, frame, engaged=engaged, plan_age=age, trouble=state.trouble
+            ),
             fallen=state.fallen,
         )
 
@@ -352,6 +360,15 @@ class Teleoperation:
     def _end_engagement(self) -> None:
         self._follower.forget()
 
+    def _tell_trouble(self, state: RobotState) -> None:
+        """Tell what the robot has begun to do that it was not told to."""
+        if state.trouble and state.trouble != self._trouble:
+            text = state.trouble[:1].upper() + state.trouble[1:]
+            ends = "Disengaged: it" if self.alignment.is_engaged else "It"
+            does = "stands, its arms go back to rest" if state.trouble == MOVES else "holds"
+            self._board.tell(Cue.DISENGAGED, f"{text}. {ends} {does}.")
+        self._trouble = state.trouble
+
     def _describe_hold(self, engaged: bool) -> tuple[str, float]:
         """What the gesture that is held will do, in words, and how much of it has passed."""
         raised = self._hands.raised
@@ -399,9 +416,17 @@ class Teleoperation:
         self._device_mode = frame.mode
 
     def _hold(self, state: RobotState) -> RobotAction:
-        """Stand where and as the robot stands: velocities stop, the posture stays."""
+        """Stand where and as the robot stands: velocities stop, the posture stays.
+
+        If it moves all the same, the arms are the cause: there are postures in which a low-level
+        policy walks off. They go back to rest then, slowly.
+        """
         command = self.morphology.command_space.compute_rest(state.command, state.mode)
-        return RobotAction(command, Mode.STATIONARY, state.arms)
+        arms = state.arms
+        if state.trouble == MOVES:
+            reach = RETREAT_RATE * self.dt
+            arms = arms + np.clip(self.morphology.rest_action().arms - arms, -reach, reach)
+        return RobotAction(command, Mode.STATIONARY, arms)
 
     def _drive(self, state: RobotState, goal: Goal, head: np.ndarray, dt: float) -> RobotAction:
         self._follower.update(state, goal)

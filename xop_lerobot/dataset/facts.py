@@ -51,7 +51,9 @@ class EpisodeFacts:
         settings: What was in force at the first frame (preset, weights, targets, body,
             constraints, mode), as JSON; an empty object where no teleoperator drove.
         changes: What changed in the course of it, as a JSON list of objects: `frame`, `time` of
-            the robot's clock [s], `source` and `change`.
+            the robot's clock [s], `source` and `change`. What the robot itself does wrong (it
+            moves though it is told to stand, or gives way under a load) is among them, with the
+            source `robot` and the change `trouble`.
     """
 
     success: bool

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from xop_lerobot.link import TickRecord
+from xop_lerobot.state import RobotState
 
 
 class Tally:
@@ -23,7 +24,7 @@ class Tally:
         finished: Whether the operator's recording has played out.
         task: The task in words.
         settings: What was in force at the first frame.
-        changes: What came into force, and with which frame.
+        changes: What came into force, or went wrong with the robot, and with which frame.
     """
 
     def __init__(self) -> None:
@@ -36,6 +37,7 @@ class Tally:
         self.task = ""
         self.settings: dict[str, Any] = {}
         self.changes: list[dict[str, Any]] = []
+        self._trouble = ""
 
     def note_changes(self, tick: TickRecord) -> None:
         """Take down what came into force with the frame that is being added."""
@@ -44,12 +46,21 @@ class Tally:
         for change in tick.changes:
             self.changes.append({"frame": self.frames, "time": tick.state.time, **change.to_dict()})
 
+    def note_state(self, state: RobotState) -> None:
+        """Take down what has become of the robot by the frame that is being added."""
+        self.fallen |= state.fallen
+        self.collision |= state.collision
+        if state.trouble and state.trouble != self._trouble:
+            self._note(self.frames, state.time, "robot", {"trouble": state.trouble})
+        self._trouble = state.trouble
+
     def mark(self, success: bool, time: float) -> None:
         """Take down what the operator says of the episode, at `time` [s] of the robot's clock."""
         self.marked = self.success = success
-        frame = max(self.frames - 1, 0)
-        change = {"frame": frame, "time": time, "source": "operator"}
-        self.changes.append({**change, "change": {"success": success}})
+        self._note(max(self.frames - 1, 0), time, "operator", {"success": success})
+
+    def _note(self, frame: int, time: float, source: str, change: dict[str, Any]) -> None:
+        self.changes.append({"frame": frame, "time": time, "source": source, "change": change})
 
     @property
     def fps(self) -> float:

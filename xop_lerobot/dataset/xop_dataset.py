@@ -247,6 +247,8 @@ class XopDataset(LeRobotDataset):
             self._video.wait()
         tally.task = str(frame["task"])
         super().add_frame(frame)
+        if state is not None:
+            tally.note_state(state)
         if tick is not None:
             tally.note_changes(tick)
             tally.driven |= tick.engaged
@@ -255,9 +257,6 @@ class XopDataset(LeRobotDataset):
         if tally.frames == 0:
             tally.first, tally.start_time = tally.last, time.time()
         tally.frames += 1
-        if state is not None:
-            tally.fallen |= state.fallen
-            tally.collision |= state.collision
         tally.success = outcome is not None and outcome.success
         if tally.marked is not None:
             tally.success = tally.marked

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -108,6 +109,9 @@ class Morphology(ABC):
     support: tuple[tuple[float, float], ...] = ()
     """Corners (x, y) in the base's frame, counterclockwise, of the area on which a robot that
     cannot step stands [m]; empty for one whose policy keeps the balance."""
+    servo_gap: float = math.inf
+    """How far a joint of the command may be behind its target before its servo counts as giving
+    way [rad]; infinite where a policy, not a servo, follows the command."""
     has_stiff_body: bool = False
     """Whether the joints of the command are on stiff servos that do just as they are told."""
 

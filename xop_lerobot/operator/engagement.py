@@ -24,9 +24,9 @@ class Engagement:
     """Engages the operator, and lets go of the robot again.
 
     A device that engages by itself does so as soon as the robot has settled. Who wears a headset
-    engages, and lets go, by the gesture of the clutch. Loss of the head's tracking and a fall
-    end an engagement, the next one aligns anew, and nobody engages while the robot counts as
-    fallen.
+    engages, and lets go, by the gesture of the clutch. Loss of the head's tracking, a fall and
+    whatever else the robot does that it was not told to end an engagement, the next one aligns
+    anew, and nobody engages meanwhile.
 
     Args:
         device: Where the operator's motion comes from.
@@ -93,7 +93,7 @@ class Engagement:
         if self.clutch is not None:
             self._follow_clutch(self.clutch, state, frame, poses)
             return frame
-        is_over = state.fallen or self.device.is_paused(state.time)
+        is_over = state.fallen or bool(state.trouble) or self.device.is_paused(state.time)
         if self.is_engaged:
             if frame is None or is_lost(frame) or is_over:
                 self.disengage()
@@ -133,6 +133,8 @@ class Engagement:
         if self.is_engaged:
             if state.fallen:
                 self._let_go("the robot has fallen")
+            elif state.trouble:
+                self.disengage()  # what is wrong is told whether anybody drives or not
             elif wish is Wish.LET_GO and (frame is None or is_lost(frame)):
                 self._let_go(self.device.trouble or UNSEEN)
             elif wish is Wish.LET_GO:
@@ -142,6 +144,8 @@ class Engagement:
             return
         if state.fallen:
             self._refuse("Not engaged: the robot has fallen. It engages when it stands.")
+        elif state.trouble:
+            self._refuse(f"Not engaged yet: {state.trouble}. Hold the gesture on.")
         elif not state.settled:
             self._refuse("Not engaged yet: the robot still moves. Hold the gesture on.")
         else:

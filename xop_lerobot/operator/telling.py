@@ -51,7 +51,12 @@ def describe_settings(change: Change) -> str:
 
 
 def list_warnings(
-    device: Device, frame: OperatorFrame | None, *, engaged: bool, plan_age: float | None
+    device: Device,
+    frame: OperatorFrame | None,
+    *,
+    engaged: bool,
+    plan_age: float | None,
+    trouble: str = "",
 ) -> tuple[str, ...]:
     """List what is wrong now, the worst first.
 
@@ -60,10 +65,13 @@ def list_warnings(
         frame: The operator now, None before the first frame.
         engaged: Whether the operator drives.
         plan_age: Age of the plan that is followed [s], None where there is none.
+        trouble: What the robot does that it was not told to; empty if nothing.
     """
-    warnings = [device.trouble] if device.trouble else []
+    warnings = [f"{trouble[:1].upper()}{trouble[1:]}."] if trouble else []
+    if device.trouble:
+        warnings.append(device.trouble)
     if frame is not None and not frame.tracked[0]:
-        if not warnings:
+        if not device.trouble:
             warnings.append("The headset does not see where it is, or sends nothing.")
     elif frame is not None:
         lost = [side for side, seen in zip(HANDS, frame.tracked[1:], strict=True) if not seen]

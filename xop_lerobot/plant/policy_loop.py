@@ -11,6 +11,7 @@ from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.plant.plant import Measurement, Plant
+from xop_lerobot.plant.watch import Watch
 from xop_lerobot.state import RobotState, freeze
 
 # Measured speed of the base under which a robot stands still [m/s]: five standard deviations of
@@ -37,6 +38,7 @@ class PolicyLoop:
         self._previous: RobotAction | None = None  # executed before, while one is executed
         self._measurement: Measurement | None = None
         self._collision = self._was_read = False
+        self._watch = Watch(morphology)
 
     @property
     def state(self) -> RobotState:
@@ -63,6 +65,7 @@ class PolicyLoop:
             fallen=measured.fallen,
             collision=self._collision or measured.collision,
             settled=bool(np.linalg.norm(measured.qvel[:3]) < _SETTLED_SPEED),
+            trouble=self._watch.trouble,
         )
 
     def reset(
@@ -80,6 +83,7 @@ class PolicyLoop:
         self.action = _round_action(start or self.morphology.rest_action())
         self._measurement = None
         self.advance(settle_s)
+        self._watch.reset()
         self._collision = self._was_read = False
 
     def execute(self, action: RobotAction, dt: float) -> RobotAction:
@@ -141,6 +145,7 @@ class PolicyLoop:
         self.plant.step(POLICY_DT)
         self._measurement = self.plant.measure()
         self._collision |= self._measurement.collision
+        self._watch.update(self._measurement.qpos, action)
 
     def close(self) -> None:
         """Close the plant; may be called twice."""

@@ -44,6 +44,7 @@ _ALL = [
     Figure("success", _FLAG, "", "the task was accomplished in the last frame"),
     Figure("fall", _FLAG, "", "the robot fell"),
     Figure("collision", _FLAG, "", "it touched anything but the ground, itself included"),
+    Figure("trouble", _FLAG, "", "it moved though it was told to stand, or gave way"),
     Figure("finished", _FLAG, "", "the operator's recording or script had played out"),
     Figure("engaged_time", _NUMBER, "s", "time in which the operator drove"),
     *_make_tracking("tracking", "head and wrists, pooled,"),

@@ -145,6 +145,15 @@ def _compute_fall(episode: Episode) -> Values:
     return {"fall": compute_falls(episode.rows[BASE], *limits) > 0}
 
 
+def _find_trouble(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
+    return () if isinstance(entry.facts.get("changes"), list) else None
+
+
+def _compute_trouble(episode: Episode) -> Values:
+    changes = (each.get("change") for each in episode.entry.facts["changes"])
+    return {"trouble": any(isinstance(each, dict) and "trouble" in each for each in changes)}
+
+
 # Tracking, smoothness.
 
 
@@ -316,6 +325,7 @@ IDLE = Measure(("idle_start", "idle_end", "idle_time"), _find_idle, _compute_idl
 MEASURES = (
     Measure(("success",), _find_success, _compute_success),
     Measure(("fall",), _find_fall, _compute_fall),
+    Measure(("trouble",), _find_trouble, _compute_trouble),
     Measure(("engaged_time",), _need(ENGAGED), _compute_engaged),
     Measure(
         tuple(name for name in FIGURES if name.startswith("tracking_")),

@@ -72,7 +72,8 @@ def _make_heading(finding: Finding) -> str:
     figures, entry = finding.figures, finding.entry
     marks = []
     for name, good, bad in (("success", "success", "no success"), ("fall", "", "fall"),
-                            ("collision", "", "collision"), ("late", "", "late")):  # fmt: skip
+                            ("collision", "", "collision"), ("trouble", "", "trouble"),
+                            ("late", "", "late")):  # fmt: skip
         value = figures.get(name)
         text = good if value else bad if value is False and name == "success" else ""
         text = bad if value and name != "success" else text

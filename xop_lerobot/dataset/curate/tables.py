@@ -140,6 +140,7 @@ _COUNTED = {
     "success": "success",
     "fall": "a fall",
     "collision": "a collision",
+    "trouble": "trouble",
     "gaps": "gaps in tracking",
     "late": "lateness",
     "dropped_frames": "dropped pictures",

@@ -91,7 +91,7 @@ function showTable() {
       }
       if (figure.kind === "text") cell.title = value ?? "";
       if (figure.name === "success" && value !== null) cell.classList.add(value ? "good" : "bad");
-      if (["fall", "collision", "late"].includes(figure.name) && value) cell.classList.add("bad");
+      if (["fall", "collision", "trouble", "late"].includes(figure.name) && value) cell.classList.add("bad");
       line.append(cell);
     }
     if (row[1].length) {

@@ -1,0 +1,164 @@
+"""Notices a robot that moves though it is told to stand, and one whose servos give way."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.low_level.policy import POLICY_DT
+from xop_lerobot.morphology.effect import Acts
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.transforms import quat_yaw
+
+MOVES = "the robot moves though it is told to stand"
+GIVES_WAY = "the robot's servos give way under the load"
+
+STRAY = 0.08
+"""How far a foot or wheel may stray from where the robot was told to stand [m]."""
+STEP = 0.10
+"""How far the feet may move against each other meanwhile [m]."""
+SETTLE_S = 1.0
+"""Time from the command to stand until the robot stands [s]; the last step is still taken."""
+STRAY_LAG_S = 0.2
+"""Time constant of the filter of places, which are as noisy as the robot's odometry [s]."""
+STEP_LAG_S = 0.04
+"""The same of the feet against each other, which the encoders tell more exactly [s]."""
+CREEP = 0.01
+"""Speed at which an estimate of the place may drift without a robot that moves [m/s]."""
+STILL = 0.1
+"""Velocity command under which a robot in mobile mode is told to stand [m/s or rad/s]."""
+SPEED = 0.3
+"""Mean speed at which it moves all the same [m/s]. Policies step on the spot and drift a bit."""
+SPAN_S = 0.5
+"""Time over which that mean is taken [s]."""
+GAP_S = 0.1
+"""Time for which a servo may be behind its target by more than the robot's `servo_gap` [s]."""
+CALM_S = 1.0
+"""Time without any of this after which the trouble is over [s]."""
+
+
+class Watch:
+    """Watches one robot, period by period, for what no operator should be surprised by.
+
+    *It moves though it is told to stand.* In stationary mode a second after the last velocity
+    command its feet, or wheels, are to stay where they are; in mobile mode, where policies step
+    on the spot, its base is not to move at speed while the velocity commands are about zero.
+    The place where it stands follows its estimate slowly, so that one that drifts is no alarm.
+
+    *Its servos give way.* A joint of the body that is behind its target by more than the robot's
+    `servo_gap` carries more than its motor can.
+
+    Args:
+        morphology: The robot.
+    """
+
+    def __init__(self, morphology: Morphology) -> None:
+        self._space = morphology.command_space
+        self._model = morphology.build_spec("planning").compile()
+        self._data = mujoco.MjData(self._model)
+        self._points = [self._model.site(point).id for point in morphology.contact_points]
+        acts = [effect.acts for effect in morphology.effects]
+        self._velocities = np.array(
+            [each in (Acts.FORWARD, Acts.LEFT, Acts.TURN) for each in acts], dtype=bool
+        )
+        self._joints = np.array([each is Acts.JOINT for each in acts], dtype=bool)
+        self._addresses = np.array(
+            [
+                int(self._model.joint(effect.joint).qposadr[0])
+                for effect in morphology.effects
+                if effect.acts is Acts.JOINT
+            ],
+            dtype=int,
+        )
+        self._servo_gap = morphology.servo_gap
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all: the robot was put somewhere else."""
+        self.trouble = ""
+        """What is wrong, in words; empty while all is well."""
+        self._mode: Mode | None = None
+        self._stood = self._gap = self._calm = 0.0
+        self._places: np.ndarray | None = None
+        self._home = self._spread = self._spread_home = np.zeros((0, 2))
+        self._track: list[np.ndarray] = []
+
+    def update(self, qpos: np.ndarray, action: RobotAction) -> None:
+        """Look at the robot after a period of its policy.
+
+        Args:
+            qpos: Measured position of the robot. Shape (nq,).
+            action: What it executes.
+        """
+        found = GIVES_WAY if self._gives_way(qpos, action) else ""
+        if self._moves(qpos, action):
+            found = found or MOVES
+        if found:
+            # A robot that folds also moves, but that is not what is to be done about.
+            self.trouble = found if found == GIVES_WAY else self.trouble or found
+            self._calm = 0.0
+            return
+        self._calm += POLICY_DT
+        if self._calm >= CALM_S:
+            self.trouble = ""
+
+    def _gives_way(self, qpos: np.ndarray, action: RobotAction) -> bool:
+        gaps = np.abs(action.command[self._joints] - qpos[self._addresses])
+        behind = np.isfinite(self._servo_gap) and gaps.max(initial=0.0) > self._servo_gap
+        self._gap = self._gap + POLICY_DT if behind else 0.0
+        return self._gap > GAP_S
+
+    def _moves(self, qpos: np.ndarray, action: RobotAction) -> bool:
+        if action.mode is not self._mode:
+            self._mode = action.mode
+            self._forget_place()
+        velocity = (action.command - self._space.neutral)[self._velocities]
+        if action.mode is Mode.STATIONARY:
+            told = np.abs(velocity) <= self._space.sway[self._velocities] + 1e-6
+        else:
+            told = np.abs(velocity) <= STILL
+        if not told.all():
+            self._forget_place()
+            return False
+        self._stood += POLICY_DT
+        if self._stood < SETTLE_S:
+            return False
+        return self._strays(qpos) if action.mode is Mode.STATIONARY else self._runs(qpos)
+
+    def _forget_place(self) -> None:
+        self._stood, self._places = 0.0, None
+        self._track.clear()
+
+    def _strays(self, qpos: np.ndarray) -> bool:
+        """Whether feet or wheels are not where they were. The first call tells where."""
+        places = self._find_places(qpos)
+        spread = places - places[0]
+        if self._places is None:
+            self._places = self._home = places
+            self._spread = self._spread_home = spread
+        self._places = self._places + (places - self._places) * (POLICY_DT / STRAY_LAG_S)
+        self._spread = self._spread + (spread - self._spread) * (POLICY_DT / STEP_LAG_S)
+        stray = np.linalg.norm(self._places - self._home, axis=1)
+        step = np.linalg.norm(self._spread - self._spread_home, axis=1)
+        if stray.max() > STRAY or step.max() > STEP:
+            self._home, self._spread_home = self._places, self._spread
+            return True
+        follow = np.minimum(1.0, CREEP * POLICY_DT / np.maximum(stray, 1e-9))
+        self._home = self._home + (self._places - self._home) * follow[:, None]
+        return False
+
+    def _find_places(self, qpos: np.ndarray) -> np.ndarray:
+        """Where each point on which it stands is, seen from above [m]. Shape (points, 2)."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self._data)
+        return self._data.site_xpos[self._points, :2].copy()
+
+    def _runs(self, qpos: np.ndarray) -> bool:
+        """Whether the base has moved at speed for `SPAN_S`."""
+        self._track.append(np.array([*qpos[:2], quat_yaw(qpos[None, 3:7])[0]]))
+        if len(self._track) <= round(SPAN_S / POLICY_DT):
+            return False
+        moved = self._track[-1] - self._track.pop(0)
+        turned = (moved[2] + np.pi) % (2 * np.pi) - np.pi
+        return bool(np.hypot(*moved[:2]) > SPEED * SPAN_S or abs(turned) > 2 * SPEED * SPAN_S)
