@@ -20,6 +20,7 @@ from xop_lerobot.operator.devices import DeviceConfig, live, make_device
 from xop_lerobot.operator.devices.avp import AvpDevice
 from xop_lerobot.operator.devices.avp_protocol import HandUpdate, make_request, parse_update
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.webxr.pairing import MAX_RATE, RateLimit
 from xop_lerobot.transforms import quat_rotate
 
 
@@ -220,6 +221,35 @@ def test_an_oversized_message_ends_the_connection_and_the_next_is_made(
     assert "it sent a message of more than 262144 bytes" in caplog.text
     send(server, device, make_person(0.01))
     assert device.status.connections == 2
+
+
+def test_a_flood_ends_the_connection_and_the_next_is_made(server, device, monkeypatch, caplog):
+    """A stream that is faster than any headset would take the processor from the robot's loop."""
+    monkeypatch.setattr(live, "RETRY_S", 0.05)
+    monkeypatch.setattr(RateLimit, "is_broken", lambda limit, time: count(limit) > MAX_RATE)
+    taken = []
+
+    def count(limit: RateLimit) -> int:  # as within a second, however slow the machine is
+        taken.append(limit)
+        return taken.count(limit)
+
+    send(server, device, make_person(0))
+    for i in range(MAX_RATE + 1):
+        server.send(make_person(i / 1000))
+    wait_for(lambda: len(server.requests) == 2)
+    assert "it sends more than 400 messages in a second" in caplog.text
+    send(server, device, make_person(0.01))
+    assert device.status.connections == 2
+
+
+def test_the_rate_is_counted_over_so_many_frames_and_no_more():
+    device: Any = make_device(DeviceConfig(type="avp", host="127.0.0.1"))
+    now = 0.0
+    device.clock = lambda: now
+    for i in range(3 * MAX_RATE):
+        now = i / 5000
+        device.receive(make_person(now))
+    assert len(device._stamps) == MAX_RATE == device.status.rate
 
 
 def test_it_needs_a_host():

@@ -19,11 +19,13 @@ from xop_lerobot.retarget.changes import (
     WEIGHT_NAMES,
     Change,
     apply_change,
+    join_change,
     make_settings,
     make_toggle,
     parse_change,
+    split_change,
 )
-from xop_lerobot.retarget.config import PRESETS, CostWeights, RetargeterConfig
+from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, CostWeights, RetargeterConfig
 from xop_lerobot.retarget.online import OnlineSettings
 from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_multiply, rotation_error
@@ -160,6 +162,109 @@ def test_changes_are_all_or_nothing_and_hold_from_the_next_tick():
     assert [each.source for each in online.take()] == ["call", "key"]
     assert online.current.preset == "conservative"
     assert online.take() == ()
+
+
+def settings_parts(number: int) -> list[dict]:
+    """One of many requests, each of which sets something else."""
+    names = sorted(set(WEIGHT_NAMES) - {"collision_range"})
+    return [
+        {"weights": {names[number % len(names)]: 1.0 + number}},
+        {"weights": {"position": 2.0, "terminal": 1.0 + number}},
+        {"preset": PRESETS[number % len(PRESETS)]},
+        {"preset": "default", "weights": {"stance": 3.0}},
+        {"variant": ("v1", "v2")[number % 2]},
+        {"targets": [("head", "left_wrist")[number % 2]]},
+        {"body": []},
+        {"constraints": {"upright": bool(number % 2)}},
+        {"mode": ("stationary", "mobile")[number % 2]},
+    ]
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    asked=st.lists(
+        st.tuples(st.integers(0, 8), st.integers(0, 40), st.sampled_from(["call", "key"])),
+        max_size=60,
+    )
+)
+def test_what_waits_for_the_tick_says_the_same_as_all_that_was_asked_for(asked):
+    morphology = make_morphology("rby1")
+    online = OnlineSettings(morphology, RetargeterConfig())
+    before, modes = online.current, []
+    for kind, number, source in asked:
+        change = parse_change(settings_parts(number)[kind])
+        online.request(change, source)
+        modes += [] if change.mode is None else [change.mode]
+    taken = [each.change for each in online.take()]
+    # No part is set twice, so what waits is never more than there are parts.
+    parts = [part for change in taken for part in split_change(change)]
+    assert len(parts) == len(set(parts)) <= len(WEIGHT_NAMES) + len(CONSTRAINTS) + 5
+    assert [change.mode for change in taken if change.mode is not None] == modes[-1:]
+    for change in taken:
+        before = apply_change(morphology, before, change)
+    assert before == online.current
+
+
+def test_a_change_is_made_of_its_parts():
+    change = parse_change(
+        {"preset": "default", "weights": {"stance": 2.0}, "body": [], "mode": "mobile"}
+    )
+    parts = split_change(change)
+    assert list(parts) == [("preset",), ("weights", "stance"), ("body",), ("mode",)]
+    assert join_change(parts) == change
+
+
+def test_what_was_asked_for_anew_is_left_out_and_the_rest_keeps_who_asked():
+    online = OnlineSettings(make_morphology("rby1"), RetargeterConfig())
+    online.request(Change(weights={"position": 2.0}, constraints={"upright": True}), "key")
+    for value in range(1, 2000):
+        online.request(Change(weights={"position": float(value)}), "control")
+    online.request(Change(mode=Mode.MOBILE), "gesture")
+    assert [(each.source, each.change.to_dict()) for each in online.take()] == [
+        ("key", {"constraints": {"upright": True}}),
+        ("control", {"weights": {"position": 1999.0}}),
+        ("gesture", {"mode": "mobile"}),
+    ]
+
+
+def test_a_tick_does_not_wait_for_a_change_that_is_being_checked():
+    online = OnlineSettings(make_morphology("rby1"), RetargeterConfig())
+    begun, go_on = threading.Event(), threading.Event()
+
+    def make(coming) -> Change:
+        del coming
+        begun.set()
+        go_on.wait(60)
+        return Change(preset="aggressive")
+
+    other = threading.Thread(target=online.request_from, args=(make, "call"))
+    other.start()
+    assert begun.wait(60)
+    assert online.take() == ()
+    assert online.current.preset == online.coming.preset == "default"
+    go_on.set()
+    other.join()
+    assert online.take()[0].change.preset == "aggressive"
+
+
+def test_thousands_of_changes_are_one_tick_of_work(rig, caplog):  # noqa: F811
+    """One notice, one line of the log and one new set of parameters, however many were asked."""
+    r = rig("rby1")
+    r.run(0.2)
+    configured = []
+    configure = r.teleop._follower.configure
+    r.teleop._follower.configure = lambda **new: (configured.append(new), configure(**new))
+    for value in range(1, 601):
+        r.teleop.change({"weights": {"position": float(value)}}, f"program {value % 7}")
+        r.teleop.change({"mode": "mobile" if value % 2 else "stationary"})
+    posted = r.teleop._board._count
+    with caplog.at_level("INFO"):
+        _, record = r.tick()
+    assert len(record.changes) == 2
+    assert record.settings["weights"] == {"position": 600.0}
+    assert len(configured) == 1
+    assert r.teleop._board._count == posted + 2
+    assert caplog.messages == ["Mode: stationary.", "Weight position 600."]
 
 
 def test_the_direct_baseline_has_a_mode_only():

@@ -8,10 +8,12 @@ import socket
 import stat
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from xop_lerobot.control import client as control_client
+from xop_lerobot.control import server as control_server
 from xop_lerobot.control.client import ControlClient, NoSession, Refused
 from xop_lerobot.control.keys import PRESET_KEYS, TOGGLE_KEYS, press
 from xop_lerobot.control.protocol import MAX_LINE, find_runtime_dir, find_socket
@@ -157,8 +159,44 @@ def test_clients_beside_each_other(server, target):
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(target.online.take()) == 80
+    assert len(target.online.take()) == len(names)  # of 80 requests, the last of each weight
     assert target.settings["weights"] == dict.fromkeys(names, 20)
+
+
+def test_who_asks_too_fast_waits_for_the_answers(server, client, monkeypatch):
+    """The first burst is answered at once; then the requests come as evenly as they may."""
+    client.request({"get": "settings"})  # it has been let in
+    now = 100.0
+
+    def sleep(wait: float) -> None:
+        nonlocal now
+        now += wait
+
+    clock = SimpleNamespace(monotonic=lambda: now, sleep=sleep)
+    monkeypatch.setattr(control_server, "time", clock)
+    server._due = 0.0
+
+    def ask(times: int) -> float:
+        begun = now
+        for _ in range(times):
+            client.request({"get": "settings"})
+        return now - begun
+
+    assert ask(50) == pytest.approx(0.0)
+    assert ask(200) == pytest.approx(2.0)
+    now += 60.0  # who was silent may ask at once again, and no more at once than before
+    assert ask(50) == pytest.approx(0.0)
+    assert ask(100) == pytest.approx(1.0)
+
+
+def test_who_comes_again_and_again_waits_too(server, monkeypatch):
+    waits: list[float] = []
+    clock = SimpleNamespace(monotonic=lambda: 100.0, sleep=waits.append)
+    monkeypatch.setattr(control_server, "time", clock)
+    server._due = 0.0
+    for _ in range(26):  # a connection and a line are two
+        send_raw(server.path, b"GET / HTTP/1.1\r\n")
+    assert waits
 
 
 def test_too_many_clients_are_sent_away(server):

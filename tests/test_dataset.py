@@ -14,6 +14,7 @@ import time
 from contextlib import nullcontext
 from pathlib import Path
 from queue import Queue
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -30,7 +31,7 @@ from xop_lerobot.dataset.columns import COST_NAMES, HEALTH_NAMES, Columns
 from xop_lerobot.dataset.facts import compute_config_hash, read_facts
 from xop_lerobot.dataset.record import build_features
 from xop_lerobot.dataset.shutdown import hold_signals
-from xop_lerobot.dataset.video_queue import VideoQueue
+from xop_lerobot.dataset.video_queue import MAX_IMAGES, VideoQueue
 from xop_lerobot.dataset.xop_dataset import DatasetExists, WrongFps, XopDataset
 from xop_lerobot.errors import BadValue, LinkError, XopError
 from xop_lerobot.link import Outcome, TickRecord, get_session
@@ -432,6 +433,32 @@ def test_waiting_for_the_encoder():
 
 def test_a_dead_encoder_is_not_waited_for():
     VideoQueue(FakeEncoder(alive=False)).wait()
+
+
+@pytest.mark.parametrize("alive", [True, False])
+def test_pictures_that_wait_for_the_disk_are_bounded(monkeypatch, alive):
+    """Who adds a frame waits until the image files have caught up; dead workers never do."""
+    waiting = list(range(MAX_IMAGES + 2))
+    monkeypatch.setattr("xop_lerobot.dataset.video_queue.time.sleep", lambda _: waiting.pop())
+    queue = SimpleNamespace(qsize=lambda: len(waiting))
+    worker = SimpleNamespace(is_alive=lambda: alive)
+    images = SimpleNamespace(queue=queue, threads=[worker], processes=[])
+    VideoQueue(None, SimpleNamespace(image_writer=images)).wait_for_images()
+    assert len(waiting) == (MAX_IMAGES - 1 if alive else MAX_IMAGES + 2)
+    VideoQueue(None, SimpleNamespace(image_writer=None)).wait_for_images()
+    VideoQueue(None).wait_for_images()
+
+
+def test_image_files_are_waited_for_while_recording(session, pair, tmp_path, monkeypatch):
+    robot, teleop = pair
+    dataset = create(session, robot, tmp_path / "data", image_writer_threads=1)
+    asked = []
+    monkeypatch.setattr(VideoQueue, "wait_for_images", lambda queue: asked.append(queue._writer))
+    tick(robot, teleop, dataset)
+    assert asked == [dataset.writer]
+    assert {"queue", "threads", "processes"} <= set(vars(dataset.writer.image_writer))
+    dataset.save_episode()
+    dataset.finalize()
 
 
 def test_dropped_frames_are_counted():

@@ -16,6 +16,7 @@ from xop_lerobot.operator.devices.live import LiveDevice
 from xop_lerobot.operator.display import Cue, NoticeBoard
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.telling import describe_settings, list_warnings, tell_changes
+from xop_lerobot.paced_log import PacedLog
 from xop_lerobot.retarget.changes import Change
 from xop_lerobot.retarget.online import AppliedChange
 
@@ -101,6 +102,60 @@ def test_each_change_has_its_cue(caplog):
         (Cue.SETTING, "Constraint upright off."),
     ]
     assert "Mode: mobile." in caplog.text
+
+
+def test_a_tick_tells_of_all_its_settings_at_once():
+    board = NoticeBoard()
+    changes = [
+        AppliedChange("key", Change(preset="conservative", mode=Mode.MOBILE)),
+        AppliedChange("control", Change(constraints={"upright": True})),
+    ]
+    tell_changes(board, changes)
+    assert [(n.cue, n.text) for n in board.notices] == [
+        (Cue.MODE, "Mode: mobile."),
+        (Cue.SETTING, "Preset conservative. Constraint upright on."),
+    ]
+
+
+def test_what_happens_all_the_time_drives_nothing_else_from_the_board():
+    board = NoticeBoard()
+    board.post(Cue.REDO, "Discarded.")
+    for i in range(100):
+        board.post(Cue.SETTING, f"Weight position {i}.")
+        board.post(Cue.MODE, f"Mode {i}.")
+    assert [n.text for n in board.notices] == [
+        "Discarded.",
+        *("Weight position 98.", "Mode 98.", "Weight position 99.", "Mode 99."),
+    ]
+    assert [n.number for n in board.notices] == [1, 198, 199, 200, 201]
+
+
+def test_a_log_that_others_cannot_fill(caplog):
+    now = 0.0
+    log = PacedLog(logging.getLogger("xop_lerobot.test"), clock=lambda: now)
+    with caplog.at_level(logging.INFO):
+        for i in range(1000):
+            log.info("line %d", i)
+        assert caplog.messages == [f"line {i}" for i in range(10)]
+        now = 1.5
+        log.warning("at last")
+        log.info("and on")
+    assert caplog.messages[10:] == [
+        "990 lines were left out: too many in a second.",
+        "at last",
+        "and on",
+    ]
+    assert caplog.records[-1].funcName == "test_a_log_that_others_cannot_fill"
+
+
+def test_the_log_of_the_board_is_paced(caplog):
+    board = NoticeBoard()
+    with caplog.at_level(logging.INFO):
+        for i in range(500):
+            board.tell(Cue.SETTING, f"Weight position {i}.")
+    # A second may end meanwhile on a slow machine, not twenty of them.
+    assert 10 <= len(caplog.messages) < 200
+    assert board.notices[-1].text == "Weight position 499."
 
 
 def test_a_toggle_is_told_when_it_holds():

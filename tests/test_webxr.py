@@ -23,7 +23,7 @@ from xop_lerobot.operator.devices.webxr import PortTaken, WebXrDevice
 from xop_lerobot.operator.display import Cue, Display, Notice, Progress, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.clock_offset import ClockOffset
-from xop_lerobot.operator.webxr.delay_meter import DelayMeter
+from xop_lerobot.operator.webxr.delay_meter import MAX_FRAMES, DelayMeter
 from xop_lerobot.operator.webxr.protocol import Bye, FrameMessage, Pong, parse_message
 from xop_lerobot.transforms import quat_from_matrix, quat_rotate
 
@@ -238,6 +238,13 @@ def test_delay_meter():
         "network, or raise device.max_delay_s"
     )
     assert take(1.2, 0.02) == ""
+
+
+def test_the_delay_is_taken_of_so_many_frames_and_no_more():
+    meter = DelayMeter(0.3)
+    for i in range(3 * MAX_FRAMES):
+        meter.take(i / 5000, 0.02, 0.01)
+    assert len(meter._frames) == MAX_FRAMES
 
 
 # -- over the wire -------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -126,7 +127,7 @@ class Teleoperation:
         self._engagement.reset()
         self._velocity.reset()
         self._hands.reset()
-        self._wishes: list[Wish] = []
+        self._wishes: deque[Wish] = deque(maxlen=8)
         self._smoother.reset()
         if self._sync is not None:
             self._sync.reset()
@@ -232,7 +233,8 @@ class Teleoperation:
 
     def take_wishes(self) -> tuple[Wish, ...]:
         """What the operator asks of the recording since the last call, by gestures or buttons."""
-        wishes, self._wishes = self._wishes, []
+        wishes = tuple(self._wishes)
+        self._wishes.clear()
         return (*wishes, *self.device.take_wishes())
 
     def answer(self, cue: Cue, text: str) -> None:

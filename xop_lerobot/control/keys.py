@@ -6,8 +6,9 @@ import logging
 from typing import Any, Protocol
 
 from xop_lerobot.errors import XopError
+from xop_lerobot.paced_log import PacedLog
 
-logger = logging.getLogger(__name__)
+_log = PacedLog(logging.getLogger(__name__))  # a key that is held down repeats
 
 PRESET_KEYS = {"d": "default", "c": "conservative", "a": "aggressive", "t": "table1"}
 TOGGLE_KEYS = {"m": "mode", "u": "upright"}
@@ -38,8 +39,8 @@ def press(key: str, target: Target) -> bool:
         else:
             return False
     except XopError as refusal:
-        logger.warning("Key %r changes nothing: %s", key, refusal)
+        _log.warning("Key %r changes nothing: %s", key, refusal)
         return True
     constraints = ", ".join(settings["constraints"]) or "none"
-    logger.info("Key %r: preset %s, constraints %s.", key, settings["preset"], constraints)
+    _log.info("Key %r: preset %s, constraints %s.", key, settings["preset"], constraints)
     return True

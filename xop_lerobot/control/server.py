@@ -7,6 +7,7 @@ import os
 import socket
 import stat
 import threading
+import time
 from pathlib import Path
 
 from xop_lerobot.control.protocol import (
@@ -17,10 +18,15 @@ from xop_lerobot.control.protocol import (
     write_object,
 )
 from xop_lerobot.errors import XopError
+from xop_lerobot.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
 
 _MAX_CLIENTS = 8
+_MAX_RATE = 100.0
+"""Requests and connections that are taken in a second, all clients together [Hz]."""
+_BURST = 50
+"""So many at once are taken without a wait."""
 _IDLE_S = 300.0  # a client that is silent for so long is let go [s]
 
 
@@ -33,7 +39,8 @@ class ControlServer:
 
     Nothing but JSON is read, a line of at most `MAX_LINE` bytes at a time; who sends anything
     else is disconnected. Requests are answered in the order in which they come in, each client
-    in a thread of its own.
+    in a thread of its own. However fast they ask, `_MAX_RATE` is all that is taken, so that the
+    robot's own loop has its share of the processor; who asks faster waits for the answers.
 
     Args:
         path: Path of the socket.
@@ -48,6 +55,8 @@ class ControlServer:
         self._clients: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._running = True
+        self._due = 0.0  # when the next request would be taken if all came evenly [s]
+        self._log = PacedLog(logger)
         self._socket = open_socket(path)
         self._inode = path.stat().st_ino
         self._thread = threading.Thread(target=self._accept, name="xop-control", daemon=True)
@@ -77,6 +86,7 @@ class ControlServer:
                 client, _ = self._socket.accept()
             except OSError:
                 return  # closed
+            self._wait_turn()
             with self._lock:
                 welcome = self._running and len(self._clients) < _MAX_CLIENTS
                 if welcome:
@@ -95,6 +105,7 @@ class ControlServer:
             client.settimeout(_IDLE_S)
             with client.makefile("rb") as lines:
                 while line := lines.readline(MAX_LINE + 1):
+                    self._wait_turn()
                     if not self._reply(client, line):
                         return
         except OSError:
@@ -103,6 +114,15 @@ class ControlServer:
             with self._lock:
                 self._clients.discard(client)
             _shut(client)
+
+    def _wait_turn(self) -> None:
+        """Wait until one more request may be taken."""
+        with self._lock:
+            now = time.monotonic()
+            self._due = max(self._due, now - _BURST / _MAX_RATE) + 1 / _MAX_RATE
+            wait = self._due - now
+        if wait > 0:
+            time.sleep(wait)
 
     def _reply(self, client: socket.socket, line: bytes) -> bool:
         """Answer one line; return whether the client may go on."""
@@ -116,7 +136,7 @@ class ControlServer:
             _send(client, {"ok": False, "error": str(fault)})
             return False
         except Exception:  # a robot must not lose its socket to one bad request
-            logger.exception("a request of the control socket has failed")
+            self._log.exception("a request of the control socket has failed")
             reply = {"ok": False, "error": "the request has failed; see the log of the session"}
         _send(client, reply)
         return True

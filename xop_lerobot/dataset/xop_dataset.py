@@ -167,7 +167,7 @@ class XopDataset(LeRobotDataset):
         self._session.begin_episode(self.num_episodes)
 
     def _attach_writer(self) -> None:
-        self._video = VideoQueue(getattr(self.writer, "_streaming_encoder", None))
+        self._video = VideoQueue(getattr(self.writer, "_streaming_encoder", None), self.writer)
         stock = self.meta.save_episode
 
         def save_with_facts(
@@ -245,6 +245,7 @@ class XopDataset(LeRobotDataset):
             frame = {**frame, **self._columns.build_row(state, tick, outcome)}
         if not self._info.realtime:
             self._video.wait()
+        self._video.wait_for_images()
         tally.task = str(frame["task"])
         super().add_frame(frame)
         if state is not None:

@@ -11,8 +11,12 @@ from enum import Enum
 import numpy as np
 
 from xop_lerobot.command import Mode
+from xop_lerobot.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
+
+MAX_ALIKE = 2
+"""Notices of one cue that are kept."""
 
 
 class Cue(Enum):
@@ -58,20 +62,28 @@ class Notice:
 
 
 class NoticeBoard:
-    """The last few notices; new ones are numbered on."""
+    """The last few notices; new ones are numbered on.
+
+    Of one cue there are at most two, so that what happens all the time, as settings that a
+    program changes, drives nothing else from the board; the log is paced for the same reason.
+    """
 
     def __init__(self, length: int = 5) -> None:
         self._notices: deque[Notice] = deque(maxlen=length)
         self._count = 0
+        self._log = PacedLog(logger)
 
     def post(self, cue: Cue, text: str) -> None:
         """Add a notice."""
         self._count += 1
+        alike = [notice for notice in self._notices if notice.cue is cue]
+        if len(alike) >= MAX_ALIKE:
+            self._notices.remove(alike[0])
         self._notices.append(Notice(self._count, cue, text))
 
     def tell(self, cue: Cue, text: str) -> None:
         """Add a notice, and log it for who sits at the terminal."""
-        logger.info(text)
+        self._log.info(text)
         self.post(cue, text)
 
     @property

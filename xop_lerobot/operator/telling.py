@@ -23,13 +23,14 @@ LATE_S = 0.3
 
 
 def tell_changes(board: NoticeBoard, changes: Iterable[AppliedChange]) -> None:
-    """Tell what has come into force: the mode with its own cue, and the rest."""
-    for each in changes:
-        if each.change.mode is not None:
-            board.tell(Cue.MODE, f"Mode: {each.change.mode.name.lower()}.")
-        settings = describe_settings(each.change)
-        if settings:
-            board.tell(Cue.SETTING, f"{settings}.")
+    """Tell what has come into force in a tick: the mode with its own cue, and the rest in one."""
+    changed = [each.change for each in changes]
+    modes = [change.mode for change in changed if change.mode is not None]
+    if modes:
+        board.tell(Cue.MODE, f"Mode: {modes[-1].name.lower()}.")
+    settings = [text for change in changed if (text := describe_settings(change))]
+    if settings:
+        board.tell(Cue.SETTING, f"{'. '.join(settings)}.")
 
 
 def describe_settings(change: Change) -> str:

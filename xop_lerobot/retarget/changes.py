@@ -84,6 +84,33 @@ class Change:
 CHANGE_NAMES = tuple(each.name for each in dataclasses.fields(Change))
 
 
+def split_change(change: Change) -> dict[tuple[str, ...], Any]:
+    """Split a change into the single things that it sets, in the order in which they apply.
+
+    Returns:
+        Values by what is set: `("preset",)`, `("weights", name)`, `("constraints", name)`, ….
+    """
+    parts: dict[tuple[str, ...], Any] = {}
+    for name in CHANGE_NAMES:
+        value = getattr(change, name)
+        if isinstance(value, Mapping):
+            parts |= {(name, key): each for key, each in value.items()}
+        elif value is not None:
+            parts[name,] = value
+    return parts
+
+
+def join_change(parts: Mapping[tuple[str, ...], Any]) -> Change:
+    """Make the change that sets `parts`, as `split_change` splits it."""
+    values: dict[str, Any] = {}
+    for (name, *key), value in parts.items():
+        if key:
+            values.setdefault(name, {})[key[0]] = value
+        else:
+            values[name] = value
+    return Change(**values)
+
+
 def check_weight(name: object, value: object) -> None:
     """Check a cost weight.
 

@@ -9,7 +9,14 @@ from typing import Any
 
 from xop_lerobot.errors import BadValue
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.changes import Change, Settings, apply_change, make_settings
+from xop_lerobot.retarget.changes import (
+    Change,
+    Settings,
+    apply_change,
+    join_change,
+    make_settings,
+    split_change,
+)
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.presets import build_configs
 
@@ -38,6 +45,10 @@ class OnlineSettings:
     asks for it: it is refused there with the reason, and then changes nothing. What is accepted
     can't fail later.
 
+    However often somebody asks, what waits for the tick does not grow: of each thing that can be
+    changed (`split_change`) only what was asked for last is kept, with who asked. Applied in
+    order, what `take` returns makes the same settings as all that was asked for.
+
     Args:
         morphology: The robot.
         config: Settings of the session.
@@ -48,9 +59,11 @@ class OnlineSettings:
 
     def __init__(self, morphology: Morphology, config: RetargeterConfig) -> None:
         self._morphology, self._config = morphology, config
-        self._lock = threading.Lock()
+        self._turn = threading.Lock()  # held by who asks, while a change is checked
+        self._lock = threading.Lock()  # held for an instant: the tick never waits for a check
         self._coming = self._current = make_settings(morphology, config)
-        self._pending: list[AppliedChange] = []
+        self._pending: dict[tuple[str, ...], tuple[int, str, Any]] = {}  # request, source, value
+        self._count = 0
 
     @property
     def current(self) -> Settings:
@@ -80,7 +93,7 @@ class OnlineSettings:
             UnknownName: As `request`.
             BadValue: As `request`.
         """
-        with self._lock:
+        with self._turn:
             change = make(self._coming)
             if self._config.type != "mpc" and set(change.to_dict()) != {"mode"}:
                 raise BadValue(
@@ -89,13 +102,36 @@ class OnlineSettings:
                 )
             coming = apply_change(self._morphology, self._coming, change)
             build_configs(self._morphology, self._config, coming)
-            self._coming = coming
-            self._pending.append(AppliedChange(source, change))
+            with self._lock:
+                self._coming = coming
+                self._queue(change, source)
             return coming
 
+    def _queue(self, change: Change, source: str) -> None:
+        """Add a change to those that wait, less what it makes void."""
+        self._count += 1
+        for part, value in split_change(change).items():
+            for void in [other for other in self._pending if _makes_void(part, other)]:
+                del self._pending[void]
+            self._pending[part] = (self._count, source, value)
+
     def take(self) -> tuple[AppliedChange, ...]:
-        """Put into force what was asked for since the last call, and return it in order."""
+        """Put into force what was asked for since the last call, and return it in order.
+
+        What was asked for anew before it came into force is left out.
+        """
         with self._lock:
-            taken, self._pending = tuple(self._pending), []
+            pending, self._pending = self._pending, {}
             self._current = self._coming
-            return taken
+        requests: dict[tuple[int, str], dict[tuple[str, ...], Any]] = {}
+        for part, (number, source, value) in pending.items():
+            requests.setdefault((number, source), {})[part] = value
+        return tuple(
+            AppliedChange(source, join_change(parts)) for (_, source), parts in requests.items()
+        )
+
+
+def _makes_void(part: tuple[str, ...], other: tuple[str, ...]) -> bool:
+    """Whether setting `part` leaves nothing of what was set of `other` before."""
+    resets = {"preset": ("weights",), "variant": ("targets", "body")}
+    return part == other or other[0] in resets.get(part[0], ())

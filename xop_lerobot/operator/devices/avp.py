@@ -13,6 +13,7 @@ from xop_lerobot.operator.devices.address import find_own_address
 from xop_lerobot.operator.devices.avp_protocol import METHOD, PORT, make_request, parse_update
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.live import LiveDevice, StreamLost
+from xop_lerobot.operator.webxr.pairing import MAX_RATE, RateLimit
 
 MAX_MESSAGE = 256 * 1024
 """Longer messages end the connection; one of two hands has about 5 kB [bytes]."""
@@ -65,8 +66,11 @@ class AvpDevice(LiveDevice):
                 self._call = call
             if self._stop.is_set():
                 call.cancel()
+            rate = RateLimit()
             try:
                 for message in call:
+                    if rate.is_broken(time.monotonic()):
+                        raise StreamLost(f"it sends more than {MAX_RATE} messages in a second")
                     self.hear()
                     frame = parse_update(message)
                     if isinstance(frame, str):

@@ -19,6 +19,8 @@ from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.one_euro import OneEuro, make_one_euro
 from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
+from xop_lerobot.operator.webxr.pairing import MAX_RATE
+from xop_lerobot.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
 
@@ -94,11 +96,12 @@ class LiveDevice(Device):
         self._thread: threading.Thread | None = None
         self._newest: OperatorFrame | None = None
         self._relocations = self._read_relocations = 0
-        self._stamps: deque[float] = deque()
+        self._stamps: deque[float] = deque(maxlen=round(MAX_RATE * RATE_WINDOW_S))
         self._heard_at = 0.0
         self._connections = 0
         self._connected = self._left = False
         self._trouble = ""
+        self._log = PacedLog(logger)  # what comes and goes is the other side's doing
 
     @property
     @abstractmethod
@@ -143,7 +146,7 @@ class LiveDevice(Device):
             except StreamLost as error:
                 lost = error
             except Exception as error:  # noqa: BLE001  the robot holds, whatever it was
-                logger.exception("%s: its stream cannot be read", self.address)
+                self._log.exception("%s: its stream cannot be read", self.address)
                 lost = StreamLost(f"{type(error).__name__}: {error}")
             with self._lock:
                 self._connected = False
@@ -154,7 +157,7 @@ class LiveDevice(Device):
     def _say(self, trouble: str) -> None:
         """Warn once of each trouble."""
         if trouble and trouble != self._trouble:
-            logger.warning(trouble)
+            self._log.warning(trouble)
         self._trouble = trouble
 
     def hear(self) -> None:
@@ -171,7 +174,7 @@ class LiveDevice(Device):
             self._connected = True
             self._connections += 1
             self._trouble = ""
-        logger.info("%s is connected.", self.address)
+        self._log.info("%s is connected.", self.address)
 
     def refuse(self, reason: str) -> None:
         """Count a message that holds no frame."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import logging
 import socket
 import sys
 import threading
@@ -28,8 +27,6 @@ from xop_lerobot.operator.webxr.pairing import check_code, make_code
 from xop_lerobot.operator.webxr.pictures import Picture, PictureEncoder
 from xop_lerobot.operator.webxr.protocol import PORT, FrameMessage, write_display, write_pose
 from xop_lerobot.operator.webxr.server import HeadsetServer
-
-logger = logging.getLogger(__name__)
 
 LOOPBACK = "127.0.0.1"
 BACKLOG = 16
@@ -138,10 +135,7 @@ class WebXrDevice(LiveDevice):
 
     def take_wishes(self) -> tuple[Wish, ...]:
         """What was asked for on the page since the last call."""
-        wishes = []
-        while self._wishes:
-            wishes.append(self._wishes.popleft())
-        return tuple(wishes)
+        return tuple(self._wishes.popleft() for _ in range(len(self._wishes)))
 
     @property
     def status(self) -> StreamStatus:
@@ -201,7 +195,7 @@ class WebXrDevice(LiveDevice):
             late = self._delay.take(now, max(delay, 0.0), error)
             trouble = self._delay.describe(now) if late and not self._was_late else ""
         if trouble:
-            logger.warning(trouble)
+            self._log.warning(trouble)
         self._was_late = late
         if late:
             self.refuse("late")

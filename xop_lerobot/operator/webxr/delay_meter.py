@@ -7,6 +7,8 @@ from collections import deque
 
 WINDOW_S = 1.0
 """Time over which the delay is taken [s]."""
+MAX_FRAMES = 400
+"""The newest that are kept of them, however many there are."""
 SLOW_S = 0.15
 """Who drives with a delay of more than this feels it [s]."""
 GROWN_S = 0.08
@@ -22,7 +24,7 @@ class DelayMeter:
 
     def __init__(self, limit: float) -> None:
         self._limit = limit
-        self._frames: deque[tuple[float, float, bool]] = deque()
+        self._frames: deque[tuple[float, float, bool]] = deque(maxlen=MAX_FRAMES)
         self._smallest = float("inf")
 
     def reset(self) -> None:

@@ -27,6 +27,7 @@ from xop_lerobot.operator.webxr.protocol import (
     write_refused,
     write_welcome,
 )
+from xop_lerobot.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
 
@@ -120,6 +121,7 @@ class HeadsetServer:
         self._farewells: set[asyncio.Task[None]] = set()
         self._connections = Connections(HANDSHAKE_S if certificate else ARRIVAL_S)
         self._port: asyncio.Server | None = None
+        self._log = PacedLog(logger)
 
     async def run(self, listener: socket.socket, stop: asyncio.Event) -> None:
         """Serve at `listener`, which is closed in the end, until `stop` is set."""
@@ -193,14 +195,14 @@ class HeadsetServer:
         client = Client(ws, request, role, self._wearer.clock)
         reason = self._door.refuse(address, request.query.get("code", ""), self._wearer.clock())
         if reason is not None:
-            logger.warning("WebXR: %s was refused: %s.", address, reason)
+            self._log.warning("WebXR: %s was refused: %s.", address, reason)
         else:
             reason = await self._find_no_room(client)
         if reason is not None:
             await self._dismiss(client, reason)
             return ws
         self._clients.add(client)
-        logger.info(
+        self._log.info(
             "WebXR: %s has come in from %s.",
             "the operator" if role == "operator" else "a monitor",
             address,
