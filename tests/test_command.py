@@ -97,6 +97,16 @@ def test_at_rest_a_walking_robot_stops_and_a_standing_one_keeps_its_sway():
     command = np.array([0.6, 0.1, 0.3])
     np.testing.assert_array_equal(SWAYING.compute_rest(command, Mode.MOBILE), [0.6, 0.0, 0.0])
     np.testing.assert_array_equal(SWAYING.compute_rest(command, Mode.STATIONARY), [0.6, 0.1, 0.0])
+    most = np.array([0.6, np.float32(0.15), 0.0])  # as the robot executes it
+    np.testing.assert_array_equal(SWAYING.compute_rest(most, Mode.STATIONARY), most)
+
+
+def test_a_standing_robot_that_is_being_stopped_has_no_sway_to_keep():
+    """Faster than any sway: it walked until just now."""
+    for velocity in (0.16, -0.6):
+        command = np.array([0.6, velocity, 0.0])
+        rest = SWAYING.compute_rest(command, Mode.STATIONARY)
+        np.testing.assert_array_equal(rest, [0.6, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(

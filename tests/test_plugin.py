@@ -18,7 +18,7 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 from toy_robot import ARM_JOINTS, SMALL, XopToy, XopToyConfig, make_teleop, make_toy
 
-from lerobot_robot_xop import LowLevelConfig, SceneConfig, XopG1Config, XopRby1Config
+from lerobot_robot_xop import LowLevelConfig, SceneConfig, XopG1, XopG1Config, XopRby1Config
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadRecording, BadValue, LinkError, NotConnected, UnknownName
 from xop_lerobot.link import get_session
@@ -270,6 +270,29 @@ def test_positions_of_an_observation_may_be_sent_back(robot):
     observation = robot.get_observation()
     sent = robot.send_action({k: v for k, v in observation.items() if k.endswith(".pos")})
     assert set(sent) == set(robot.action_features)
+
+
+def test_who_moves_joints_alone_does_not_walk_on():
+    """As LeRobot does when a policy has ended in mid-walk and the robot goes to its start."""
+    robot = XopG1(XopG1Config(session="joints alone", cameras=[]))
+    robot.connect()
+    keys = ("x.vel", "y.vel", "theta.vel")
+    try:
+        for _ in range(8):
+            sent = robot.send_action(
+                {"mode.pos": 1.0, **dict.fromkeys(keys, 0.3), "height.pos": 0.7}
+            )
+        assert sent["x.vel"] == pytest.approx(0.3)
+        observation = robot.get_observation()
+        back = {key: value for key, value in observation.items() if key.endswith(".pos")}
+        for _ in range(10):
+            sent = robot.send_action(back)
+        assert [sent[key] for key in keys] == [0.0, 0.0, 0.0]
+        assert sent["height.pos"] == pytest.approx(0.7)
+        # Whoever asks for a velocity anew has it.
+        assert robot.send_action({"x.vel": 0.3})["x.vel"] > 0
+    finally:
+        robot.disconnect()
 
 
 def test_bad_actions(robot):

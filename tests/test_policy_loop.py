@@ -360,6 +360,86 @@ def test_the_watchdog_waits_for_half_a_second(realtime):
     )
 
 
+G1 = make_morphology("g1")
+VELOCITIES = G1.command_space.mobile_only
+
+
+@pytest.fixture
+def walker():
+    """A G1, whose policy takes small velocities of a standing robot for its sway."""
+    loop = RealtimeLoop(G1, Diary(), Echo())
+    loop.reset(settle_s=0.0)
+    loop._halt()
+    yield loop
+    loop.close()
+
+
+def drive(loop: RealtimeLoop, mode: Mode, velocity: float, ticks: int = 40) -> RobotAction:
+    """Let the G1 walk, or sway, ahead and aside."""
+    command = G1.command_space.neutral.copy()
+    command[VELOCITIES] = velocity
+    wanted = RobotAction(command, mode, G1.rest_action().arms)
+    return [loop.execute(wanted, 0.04) for _ in range(ticks)][-1]
+
+
+def guard(loop: RealtimeLoop, periods: int) -> list[RobotAction]:
+    """What the watchdog makes of the command when nobody sends one."""
+    actions = []
+    loop._handed_over = time.monotonic() - 60
+    for _ in range(periods):
+        loop._guard()
+        actions.append(loop._loop.action)
+    return actions
+
+
+def test_the_watchdog_leaves_nothing_of_a_walk(walker):
+    """A walking robot ends with velocities of zero, not with the sway of a standing one."""
+    begin = drive(walker, Mode.MOBILE, 0.6)
+    assert begin.command[VELOCITIES] == pytest.approx(0.6)
+    actions = guard(walker, 100)
+    speeds = np.array([action.command[VELOCITIES] for action in actions])
+    np.testing.assert_array_equal(speeds[-1], 0.0)
+    reach = G1.command_space.max_rate[VELOCITIES] * POLICY_DT
+    assert (np.abs(np.diff(speeds, axis=0)) <= reach + 1e-6).all()
+    # It is told to stand when it does, not before: else the rest would count as its sway.
+    modes = [action.mode for action in actions]
+    stopped = modes.index(Mode.STATIONARY)
+    assert stopped > 5 and (np.abs(speeds[stopped:]) < 1e-6).all()
+    assert set(modes[stopped:]) == {Mode.STATIONARY}
+    for action in actions:
+        resting = G1.command_space.compute_rest(action.command, action.mode)
+        assert (np.abs(resting[VELOCITIES]) < 1e-6).all()
+    rest = begin.command[~VELOCITIES]
+    np.testing.assert_array_equal(actions[-1].command[~VELOCITIES], rest)
+    np.testing.assert_array_equal(actions[-1].arms, begin.arms)
+
+
+def test_the_watchdog_leaves_a_standing_robot_its_sway(walker):
+    begin = drive(walker, Mode.STATIONARY, 0.08)
+    actions = guard(walker, 50)
+    np.testing.assert_array_equal(actions[-1].command, begin.command)
+    assert actions[-1].mode is Mode.STATIONARY
+
+
+def test_the_watchdog_leaves_nothing_of_a_walk_that_was_being_stopped(walker):
+    drive(walker, Mode.MOBILE, 0.6)
+    begin = drive(walker, Mode.STATIONARY, 0.0, ticks=2)
+    assert (begin.command[VELOCITIES][:2] > 0.3).all()
+    np.testing.assert_array_equal(guard(walker, 200)[-1].command[VELOCITIES], 0.0)
+
+
+def test_each_silence_is_stopped_from_where_the_robot_is_then(walker):
+    drive(walker, Mode.MOBILE, 0.6)
+    guard(walker, 100)
+    command = G1.command_space.neutral.copy()
+    command[0] -= 0.02  # lower, and slow
+    lower = [
+        walker.execute(RobotAction(command, Mode.STATIONARY, G1.rest_action().arms), 0.04)
+        for _ in range(20)
+    ][-1]
+    np.testing.assert_array_equal(guard(walker, 10)[-1].command, lower.command)
+
+
 def test_a_failure_in_the_thread_reaches_the_caller(realtime):
     realtime.reset(settle_s=0.0)
     realtime._loop.plant.failure = RuntimeError("the motors are off")

@@ -160,10 +160,17 @@ class CommandSpace:
         return np.clip(command, self.low, self.high)
 
     def compute_rest(self, command: np.ndarray, mode: Mode) -> np.ndarray:
-        """What a robot that executes `command` in `mode` keeps of it to stand still. (k,)."""
-        if mode is Mode.STATIONARY:
-            return self.restrict(command, mode)
-        return np.where(self.mobile_only, self.neutral, command)
+        """What a robot that executes `command` in `mode` keeps of it to stand still. (k,).
+
+        A standing robot keeps its sway, which holds its weight where it is. A walking one keeps
+        nothing of a velocity, nor does one that is faster than any sway: it is being stopped, and
+        what is left of its velocity on the way down is no sway either. So who stops a robot asks
+        this once, or leaves it mobile until its velocities have stopped.
+        """
+        stops = self.mobile_only & (np.abs(command - self.neutral) > self.sway + 1e-6)
+        if mode is Mode.MOBILE:
+            stops = self.mobile_only
+        return np.clip(np.where(stops, self.neutral, command), self.low, self.high)
 
     def index(self, name: str) -> int:
         """Return the position of `name`.

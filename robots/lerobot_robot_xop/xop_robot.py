@@ -177,8 +177,10 @@ class XopRobot(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         """Execute `action` for one control period.
 
-        What `action` leaves out stays as it was. Keys of `observation.state` that are no action
-        are passed over: LeRobot sends them when it moves a robot back to where it started.
+        Positions that `action` leaves out stay as they were; a velocity that is not asked for
+        anew stops, so nobody who moves joints alone walks on. Keys of `observation.state` that
+        are no action are passed over: LeRobot sends them when it moves a robot back to where it
+        started.
 
         Returns:
             What the robot really executes, limits applied, for every action key.
@@ -189,10 +191,11 @@ class XopRobot(Robot):
             BadValue: If a value is not finite.
         """
         loop = self._connected_loop
-        layout = self.morphology.layout
+        layout, last = self.morphology.layout, self._last_action
+        resting = self.morphology.command_space.compute_rest(last.command, last.mode)
         sensed = set(self._body.state_keys) - set(layout.keys)
         known = {key: value for key, value in action.items() if key not in sensed}
-        wanted = layout.from_dict(known, self._last_action)
+        wanted = layout.from_dict(known, dataclasses.replace(last, command=resting))
         self._last_action = loop.execute(wanted, 1 / self.config.fps)
         if self._stage is not None:
             self._session.outcome = self._stage.update()

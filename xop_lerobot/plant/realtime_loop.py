@@ -7,6 +7,8 @@ import logging
 import threading
 import time
 
+import numpy as np
+
 from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
@@ -40,6 +42,7 @@ class RealtimeLoop:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._handed_over = 0.0
+        self._resting: np.ndarray | None = None  # where the watchdog brings the command
         self._failure: BaseException | None = None
         self.late_ticks = 0
         """Policy periods that began more than one period late."""
@@ -66,7 +69,7 @@ class RealtimeLoop:
         self._failure = None
         self._loop.reset(seed, settle_s, start)
         self._stop.clear()
-        self._handed_over = time.monotonic()
+        self._handed_over, self._resting = time.monotonic(), None
         self._thread = threading.Thread(target=self._run, name="xop-policy", daemon=True)
         self._thread.start()
 
@@ -80,7 +83,7 @@ class RealtimeLoop:
             self._check()
             limited = limit_action(self.morphology, action, self._loop.action, dt)
             self._loop.action = limited
-            self._handed_over = time.monotonic()
+            self._handed_over, self._resting = time.monotonic(), None
         return limited
 
     def close(self) -> None:
@@ -123,10 +126,19 @@ class RealtimeLoop:
             time.sleep(0)  # a loop that is always late must still let `execute` have the lock
 
     def _guard(self) -> None:
-        """Stop the robot when nobody has commanded it for too long."""
+        """Stop the robot when nobody has commanded it for too long.
+
+        It is told to stand once its velocities have stopped: whoever takes it over on the way
+        would else take what is left of them for the sway of a standing robot.
+        """
         if time.monotonic() - self._handed_over < _WATCHDOG_S:
             return
         action, space = self._loop.action, self.morphology.command_space
-        resting = space.compute_rest(action.command, action.mode)
-        wanted = dataclasses.replace(action, command=resting, mode=Mode.STATIONARY)
-        self._loop.action = limit_action(self.morphology, wanted, action, POLICY_DT)
+        if self._resting is None:
+            self._resting = space.compute_rest(action.command, action.mode)
+        wanted = dataclasses.replace(action, command=self._resting)
+        action = limit_action(self.morphology, wanted, action, POLICY_DT)
+        moves = space.mobile_only & (np.abs(action.command - self._resting) > 1e-6)
+        if not moves.any():
+            action = dataclasses.replace(action, mode=Mode.STATIONARY)
+        self._loop.action = action
