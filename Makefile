@@ -23,7 +23,8 @@ setup:  ## Make .venv and install the project (the other verbs do it by themselv
 demo: setup  ## Record and show one episode of each robot, in outputs/demo
 	@$(PYTHON) scripts/demo.py
 
-test: setup  ## Lint, then run the tests
+test: setup  ## Lint, then run the tests; what they skipped and why stands at the end
+	@$(PYTHON) scripts/setup.py --test-tools
 	@$(PYTHON) -m ruff check --quiet $(SOURCES)
 	@$(PYTHON) -m pytest -q
 

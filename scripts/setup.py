@@ -62,6 +62,14 @@ COMPILER_PACKAGES = {
     "zypper": ("gcc", "glibc-devel", "linux-glibc-devel"),
 }
 PYTHON_HEADERS = {"apt-get": "python{}-dev", "dnf": "python{}-devel", "zypper": "python{}-devel"}
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+"""Programs that `tests/browser.py` starts, whichever is found first."""
+TEST_PACKAGES = {
+    "apt-get": {"Chromium": "chromium", "certutil": "libnss3-tools"},
+    "dnf": {"Chromium": "chromium", "certutil": "nss-tools"},
+    "pacman": {"Chromium": "chromium", "certutil": "nss"},
+    "zypper": {"Chromium": "chromium", "certutil": "mozilla-nss-tools"},
+}
 INSTALL_COMMANDS = {
     "apt-get": ("apt-get", "install", "-y", "--no-install-recommends"),
     "dnf": ("dnf", "install", "-y"),
@@ -154,11 +162,68 @@ def install_system_packages(gl: bool, compiler: bool) -> None:
             f"{missing} {verb} missing and may not be installed here. Run:\n  {by_hand}"
         )
     say(f"Installing {missing}: {' '.join(packages)} (XOP_NO_SYSTEM=1 forbids it)")
-    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    if manager == "apt-get":  # lists may be old or absent; a failing mirror need not matter
-        run_logged((*prefix, "apt-get", "update"), "reading package lists", environment)
-    if run_logged((*prefix, *command), "installing system packages", environment) != 0:
+    refresh_lists(manager, prefix)
+    if not install_packages(manager, prefix, packages):
         raise SetupError(f"the package manager failed:\n{read_tail()}\nRun by hand:\n  {by_hand}")
+
+
+def refresh_lists(manager: str, prefix: tuple[str, ...]) -> None:
+    """Read apt's package lists anew; they may be old or absent, and a failing mirror may pass."""
+    if manager == "apt-get":
+        run_logged((*prefix, "apt-get", "update"), "reading package lists", dict(os.environ))
+
+
+def install_packages(manager: str, prefix: tuple[str, ...], packages: list[str]) -> bool:
+    """Install `packages`, the output in the log; return whether that went well."""
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    command = (*prefix, *INSTALL_COMMANDS[manager], *packages)
+    return run_logged(command, "installing system packages", environment) == 0
+
+
+def has_browser() -> bool:
+    """Whether the tests find a Chromium: named, on the path, or Playwright's own."""
+    if os.environ.get("CHROMIUM") or any(map(shutil.which, BROWSERS)):
+        return True
+    caches = [Path.home() / folder / "ms-playwright" for folder in (".cache", "Library/Caches")]
+    if chosen := os.environ.get("PLAYWRIGHT_BROWSERS_PATH"):
+        caches = [Path(chosen)]
+    return any(next(cache.glob("chromium-*/INSTALLATION_COMPLETE"), None) for cache in caches)
+
+
+def list_missing_test_tools() -> list[str]:
+    """List what the tests of pages lack here; they skip without it."""
+    missing = [] if has_browser() else ["Chromium"]
+    return missing + ([] if shutil.which("certutil") else ["certutil"])
+
+
+def bring_test_tools() -> None:
+    """Install what tests of pages need, where that may be; else say what to run, and go on.
+
+    It never fails: without these tools the tests of pages skip, and say so at the end.
+    """
+    if not (missing := list_missing_test_tools()):
+        return
+    manager, prefix = find_manager(), find_root_prefix()
+    packages = TEST_PACKAGES[manager] if manager else {}
+    if manager and prefix is not None:
+        with hold_lock():
+            names = [packages[tool] for tool in list_missing_test_tools()]
+            if names:
+                say(f"Installing for the tests: {' '.join(names)} (XOP_NO_SYSTEM=1 forbids it)")
+                refresh_lists(manager, prefix)
+            for name in names:  # each by itself: one that has no package keeps nothing else out
+                install_packages(manager, prefix, [name])
+        if not (missing := list_missing_test_tools()):
+            return
+    if not manager:
+        ways = "Install with the system's package manager"
+    else:
+        names = [packages[tool] for tool in missing]
+        ways = f"Run:\n  sudo {' '.join((*INSTALL_COMMANDS[manager], *names))}"
+    if "Chromium" in missing:
+        ways += f"\nor, for Chromium:\n  {PYTHON} -m playwright install --with-deps chromium"
+    verb = "is" if len(missing) == 1 else "are"
+    say(f"{' and '.join(missing)} {verb} missing: tests of pages will skip. {ways}")
 
 
 def say(line: str) -> None:
@@ -412,10 +477,14 @@ def main() -> int:
     """Run the set-up and return its exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--stamp", help="what setup.sh computed from the files that matter")
+    parser.add_argument("--test-tools", action="store_true", help="bring what tests need beside")
     parser.add_argument("--write-lock", action="store_true", help="freeze .venv's versions")
     arguments = parser.parse_args()
     if arguments.write_lock:
         write_lock()
+        return 0
+    if arguments.test_tools:
+        bring_test_tools()
         return 0
     if not arguments.stamp:
         parser.error("run scripts/setup.sh, which starts this with --stamp")

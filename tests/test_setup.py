@@ -277,6 +277,158 @@ def test_a_failing_pip_shows_the_end_of_its_output(
     del capsys
 
 
+# -- what the tests of pages need -----------------------------------------------------------
+
+
+PROGRAMS = {"chromium": "chromium", "libnss3-tools": "certutil"}
+
+
+@pytest.fixture
+def apt(setup: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A system whose apt-get writes down what it is asked for, and where nothing is installed.
+
+    What it can install stands in `shelf`, a line a package; with no such file it fails.
+    """
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    places = "".join(
+        f'    *" {package}") : > "{folder}/{program}"; /bin/chmod +x "{folder}/{program}" ;;\n'
+        for package, program in PROGRAMS.items()
+    )
+    script = folder / "apt-get"
+    script.write_text(
+        "#!/bin/sh\n"
+        f'echo "$*" >> "{tmp_path}/asked"\n'
+        f'[ -f "{tmp_path}/shelf" ] || {{ echo "no mirror answers"; exit 100; }}\n'
+        'case "$*" in update) exit 0 ;; esac\n'
+        'for package in "$@"; do :; done\n'
+        f'while read -r line; do [ "$line" = "$package" ] && found=1; done < "{tmp_path}/shelf"\n'
+        '[ -n "$found" ] || { echo "E: Unable to locate package $package"; exit 100; }\n'
+        f'case " $*" in\n{places}esac\n'
+    )
+    script.chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.setenv("PLAYWRIGHT_BROWSERS_PATH", str(tmp_path / "playwright"))
+    monkeypatch.delenv("CHROMIUM", raising=False)
+    monkeypatch.delenv("XOP_NO_SYSTEM", raising=False)
+    monkeypatch.setattr(setup.os, "geteuid", lambda: 0)
+    return tmp_path
+
+
+def get_asked(system: Path) -> list[str]:
+    asked = system / "asked"
+    return asked.read_text().splitlines() if asked.exists() else []
+
+
+def run_setup(setup: ModuleType, monkeypatch: pytest.MonkeyPatch, *flags: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["setup.py", *flags])
+    return setup.main()
+
+
+def test_what_the_tests_of_pages_need_is_installed_once(
+    setup: ModuleType, apt: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    (apt / "shelf").write_text("chromium\nlibnss3-tools\n")
+    assert setup.list_missing_test_tools() == ["Chromium", "certutil"]
+    assert run_setup(setup, monkeypatch, "--test-tools") == 0
+    install = "install -y --no-install-recommends"
+    assert get_asked(apt) == ["update", f"{install} chromium", f"{install} libnss3-tools"]
+    told = capsys.readouterr().out
+    assert told == (
+        "Installing for the tests: chromium libnss3-tools (XOP_NO_SYSTEM=1 forbids it)\n"
+    )
+    # The next time there is nothing to do, and nothing is asked or said.
+    assert run_setup(setup, monkeypatch, "--test-tools") == 0
+    assert len(get_asked(apt)) == 3
+    assert capsys.readouterr().out == ""
+
+
+def test_a_system_without_chromium_still_gets_the_rest(
+    setup: ModuleType, apt: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """As Ubuntu, whose apt has no Chromium."""
+    (apt / "shelf").write_text("libnss3-tools\n")
+    assert run_setup(setup, monkeypatch, "--test-tools") == 0
+    assert setup.list_missing_test_tools() == ["Chromium"]
+    assert capsys.readouterr().out.splitlines()[1:] == [
+        "Chromium is missing: tests of pages will skip. Run:",
+        "  sudo apt-get install -y --no-install-recommends chromium",
+        "or, for Chromium:",
+        f"  {setup.PYTHON} -m playwright install --with-deps chromium",
+    ]
+    (apt / "playwright" / "chromium-1").mkdir(parents=True)
+    (apt / "playwright" / "chromium-1" / "INSTALLATION_COMPLETE").touch()
+    assert setup.list_missing_test_tools() == []
+
+
+def test_without_a_mirror_the_tests_run_all_the_same(
+    setup: ModuleType, apt: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    assert run_setup(setup, monkeypatch, "--test-tools") == 0
+    told = capsys.readouterr().out
+    assert "Chromium and certutil are missing: tests of pages will skip. Run:\n" in told
+    assert "\n  sudo apt-get install -y --no-install-recommends chromium libnss3-tools\n" in told
+    assert "no mirror answers" in setup.LOG.read_text()
+
+
+@pytest.mark.parametrize("manager", ["apt-get", "dnf", "pacman", "zypper", None])
+def test_tools_that_may_not_be_installed_are_told_as_a_command(
+    setup: ModuleType,
+    apt: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    manager: str | None,
+) -> None:
+    monkeypatch.setenv("XOP_NO_SYSTEM", "1")
+    monkeypatch.setattr(setup, "find_manager", lambda: manager)
+    assert run_setup(setup, monkeypatch, "--test-tools") == 0
+    assert get_asked(apt) == []
+    told = capsys.readouterr().out
+    assert told.startswith("Chromium and certutil are missing: tests of pages will skip. ")
+    if manager is None:
+        assert "Install with the system's package manager\n" in told
+    else:
+        names = " ".join(setup.TEST_PACKAGES[manager].values())
+        assert f"  sudo {manager} " in told and f" {names}\n" in told
+
+
+def test_the_tests_and_the_set_up_look_for_the_same_browsers(setup: ModuleType) -> None:
+    from browser import NAMES
+
+    assert setup.BROWSERS == NAMES
+    assert list(setup.TEST_PACKAGES) == list(setup.INSTALL_COMMANDS)
+
+
+def test_make_test_brings_the_tools_before_it_tests() -> None:
+    shown = subprocess.run(
+        ["make", "-n", "-C", ROOT, "--no-print-directory", "test"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.splitlines()
+    places = [
+        next(i for i, line in enumerate(shown) if part in line)
+        for part in ("scripts/setup.sh", "scripts/setup.py --test-tools", "-m pytest -q")
+    ]
+    assert places == sorted(places)
+
+
+def test_what_is_skipped_is_told_at_the_end_with_its_reason(tmp_path: Path) -> None:
+    (tmp_path / "test_it.py").write_text(
+        "import pytest\ndef test_page():\n    pytest.skip('needs Chromium: get it')\n"
+    )
+    command = [sys.executable, "-m", "pytest", "-q", "-c", ROOT / "pyproject.toml"]
+    done = subprocess.run(
+        [*command, "--rootdir", tmp_path, "-p", "no:cacheprovider", tmp_path / "test_it.py"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    *_, skipped, summary = done.stdout.splitlines()
+    assert skipped.startswith("SKIPPED [1] ") and skipped.endswith(": needs Chromium: get it")
+    assert summary.startswith("1 skipped in ")
+
+
 @pytest.mark.parametrize("loads", [True, False])
 def test_torchcodec_stays_where_it_loads(
     setup: ModuleType, monkeypatch: pytest.MonkeyPatch, loads: bool
