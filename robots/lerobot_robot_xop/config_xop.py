@@ -8,8 +8,9 @@ from typing import ClassVar
 from lerobot.robots.config import RobotConfig
 
 from xop_lerobot.errors import BadValue, UnknownName
-from xop_lerobot.plant.config import NoiseConfig, SimulationConfig
+from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
 from xop_lerobot.tasks.task import get_task
+from xop_lerobot.yaml_words import fill_nulls, find_text, find_word, recover_typed
 
 POLICY_HZ = 50
 """Rate of every low-level policy [Hz]; the control loop's rate divides it."""
@@ -25,6 +26,12 @@ class SceneConfig:
     sensors: NoiseConfig = field(default_factory=NoiseConfig)  # single numbers over the preset's
     viewer_port: int = 8012  # port of the browser view, where there is no display
 
+    def __post_init__(self) -> None:
+        """Take the words back that YAML took for something else: `off` is a name here."""
+        if self.noise is not None:
+            self.noise = find_word(self.noise, NOISE_PRESETS)
+        fill_nulls(self)
+
 
 @dataclass
 class LowLevelConfig:
@@ -32,6 +39,10 @@ class LowLevelConfig:
 
     name: str = "default"  # policy; default is the robot's own
     path: str | None = None  # the policy's file, where it takes one
+
+    def __post_init__(self) -> None:
+        """Take the words back that YAML took for something else."""
+        fill_nulls(self)
 
 
 @dataclass(kw_only=True)
@@ -62,6 +73,10 @@ class XopRobotConfig(RobotConfig):
             BadValue: If a number is out of its range, with the range.
             UnknownName: If there is no such task, clock or noise, with the known ones.
         """
+        fill_nulls(self)
+        self.task, self.sim.scene = find_text(self.task), find_text(self.sim.scene)
+        recover_typed(self, "robot", "session")
+        recover_typed(self.low_level, "robot.low_level", "path")
         if self.fps < 1 or POLICY_HZ % self.fps:
             divisors = [n for n in range(1, POLICY_HZ + 1) if POLICY_HZ % n == 0]
             raise BadValue(
@@ -71,7 +86,7 @@ class XopRobotConfig(RobotConfig):
         if self.clock not in CLOCKS:
             raise UnknownName("robot.clock", self.clock, CLOCKS)
         if isinstance(self.cameras, str):
-            names = self.cameras.strip("[] ").split(",")
+            names = find_text(self.cameras.strip("[] ")).split(",")
             self.cameras = [name.strip() for name in names if name.strip()]
         if len(set(self.cameras)) < len(self.cameras):
             raise BadValue(f"robot.cameras names a camera twice: {', '.join(self.cameras)}")

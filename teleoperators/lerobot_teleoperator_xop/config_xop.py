@@ -10,6 +10,7 @@ from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.gestures import GestureConfig
 from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.yaml_words import fill_nulls, recover_typed
 
 
 @dataclass
@@ -17,6 +18,10 @@ class RecordingConfig:
     """What `lerobot-record` and `lerobot-rollout` write of a session."""
 
     columns: bool = True  # record operator, goal, retargeter, robot and time columns
+
+    def __post_init__(self) -> None:
+        """Take the words back that YAML took for something else."""
+        fill_nulls(self)
 
 
 @TeleoperatorConfig.register_subclass("xop")
@@ -32,3 +37,10 @@ class XopConfig(TeleoperatorConfig):
     control: str = ""  # socket for changes: empty for none, true for the default path, or a path
     keys: bool = False  # let keys of this terminal change settings
     record: RecordingConfig = field(default_factory=RecordingConfig)  # what is written
+
+    def __post_init__(self) -> None:
+        """Take the words back that YAML took for something else."""
+        fill_nulls(self)
+        recover_typed(self, "teleop", "session", "control")
+        recover_typed(self.device, "teleop.device", "path", "host", "code")
+        recover_typed(self.retargeter, "teleop.retargeter", "variant", "obstacles")

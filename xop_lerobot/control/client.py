@@ -19,7 +19,7 @@ from typing import Any, Self
 from xop_lerobot.control.protocol import MAX_LINE, find_socket, read_object, write_object
 from xop_lerobot.errors import BadValue, XopError
 
-_SWITCH = {"on": True, "true": True, "off": False, "false": False}
+_SWITCH = {"on": True, "true": True, "yes": True, "off": False, "false": False, "no": False}
 
 
 class NoSession(XopError):

@@ -18,6 +18,7 @@ from xop_lerobot.errors import BadValue, XopError
 
 MAX_LINE = 16_384
 """Longest request or answer [bytes]."""
+_OFF, _ON = {"", "false", "off", "no", "none"}, {"true", "on", "yes"}
 _MAX_ERROR = 2_000  # longest error in an answer [characters]
 _MAX_PATH = 100  # the kernel takes 107 bytes on Linux and 103 on macOS
 
@@ -47,8 +48,8 @@ def find_socket(control: str, session: str) -> Path | None:
     """Find where the control socket is.
 
     Args:
-        control: Empty or `false` for none, `true` for the session's path in the user's runtime
-            directory, or a path.
+        control: Empty, `false`, `off`, `no` or `none` for none; `true`, `on` or `yes` for the
+            session's path in the user's runtime directory; or a path.
         session: Name of the session.
 
     Returns:
@@ -57,10 +58,10 @@ def find_socket(control: str, session: str) -> Path | None:
     Raises:
         BadValue: If the path is longer than a socket's may be, or the session is no file name.
     """
-    if control.lower() in {"", "false"}:
+    if control.lower() in _OFF:
         return None
     path = Path(control)
-    if control.lower() == "true":
+    if control.lower() in _ON:
         if "/" in session:
             raise BadValue(f"session {session!r} names no file. Give --teleop.control a path")
         path = find_runtime_dir() / f"{session}.sock"

@@ -8,6 +8,7 @@ from typing import Any
 
 from xop_lerobot.command_line import CommandParser
 from xop_lerobot.dataset.collect_config import CollectConfig
+from xop_lerobot.yaml_words import find_text
 
 
 def add_config(
@@ -26,6 +27,8 @@ def add_config(
         default = defaults[name.replace("-", "_")]
         shown = ",".join(default) if isinstance(default, tuple) else default
         text = texts.get(name) or f"{text} (default: {'none' if shown == '' else shown})"
+        if default == "":  # "none" is what the help says of it
+            options.setdefault("type", find_text)
         parser.add_argument(f"--{name}", help=text, default=default, **options)
 
     add("seed", "seed of all that is random", type=int)
@@ -61,7 +64,8 @@ def add_crew(parser: CommandParser) -> None:
 
 def split(text: str) -> tuple[str, ...]:
     """Read names with commas between."""
-    return tuple(name.strip() for name in text.strip("[] ").split(",") if name.strip())
+    names = find_text(text.strip("[] ")).split(",")
+    return tuple(name.strip() for name in names if name.strip())
 
 
 def read_config[C: CollectConfig](kind: type[C], arguments: argparse.Namespace, **more: Any) -> C:

@@ -13,6 +13,8 @@ from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.evaluation.methods import get_method
 from xop_lerobot.evaluation.study import Cell, make_cell
 from xop_lerobot.evaluation.trial import TrialSetup
+from xop_lerobot.plant.config import NOISE_PRESETS
+from xop_lerobot.yaml_words import find_word, load_yaml
 
 _STUDY_KEYS = ("trials", "seed", "noise", "fps", "time_limit", "low_level_paths", "groups")
 _LISTS = ("tasks", "methods", "variants", "low_levels")
@@ -36,7 +38,7 @@ def load_study(path: Path, overrides: Mapping[str, Any] | None = None) -> list[C
         UnknownName: If a key or a name is unknown, listing the known ones.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = load_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise BadValue(f"study '{path}' cannot be read: {error.strerror}") from error
     except yaml.YAMLError as error:
@@ -70,6 +72,10 @@ def make_cells(group: Mapping[str, Any]) -> list[Cell]:
     """
     kept = ("noise", "scene", "fps", "time_limit")
     common = {name: group[name] for name in kept if group.get(name)}
+    if group.get("noise") is not None:
+        common["noise"] = find_word(group["noise"], NOISE_PRESETS)
+        if common["noise"] not in NOISE_PRESETS:
+            raise UnknownName("noise preset", common["noise"], NOISE_PRESETS)
     paths = group.get("low_level_paths") or {}
     combinations = product(
         group["tasks"],

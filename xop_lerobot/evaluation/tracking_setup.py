@@ -15,6 +15,7 @@ from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
 from xop_lerobot.retarget.presets import build_configs
+from xop_lerobot.yaml_words import load_yaml
 
 
 @dataclass(frozen=True)
@@ -287,12 +288,10 @@ def parse_overrides(settings: Sequence[str]) -> dict[str, Any]:
     Raises:
         BadValue: If one has no ``=``.
     """
-    import yaml  # noqa: PLC0415
-
     overrides = {}
     for setting in settings:
         name, separator, value = setting.partition("=")
         if not separator:
             raise BadValue(f"a setting reads name=value, got '{setting}'")
-        overrides[name] = yaml.safe_load(value)
+        overrides[name] = load_yaml(value, switches=True)
     return overrides

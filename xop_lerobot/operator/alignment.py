@@ -21,6 +21,7 @@ from xop_lerobot.transforms import (
     quat_multiply,
     quat_rotate,
 )
+from xop_lerobot.yaml_words import fill_nulls
 
 MIN_OPERATOR_HEIGHT = 0.5
 """Head height of a person under which the device's origin is surely not the floor [m]."""
@@ -71,6 +72,7 @@ class AlignmentConfig:
                 frame.
             UnknownName: If a frame is unknown, with the known ones.
         """
+        fill_nulls(self)
         for name in (*SCALES, *LENGTHS):
             scale = getattr(self, name)
             if scale is not None and not (math.isfinite(scale) and scale > 0):

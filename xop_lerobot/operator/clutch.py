@@ -11,6 +11,7 @@ import numpy as np
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.transforms import quat_rotate
+from xop_lerobot.yaml_words import fill_nulls
 
 GESTURES = ("palms_up", "both_pinch")
 """`palms_up`: both hands pinch with their palms up. `both_pinch`: both pinch, however they lie."""
@@ -47,6 +48,7 @@ class ClutchConfig:
             UnknownName: If there is no such gesture, with the known ones.
             BadValue: If a number is not above 0, or `on` is not below `off`.
         """
+        fill_nulls(self)
         if self.gesture not in GESTURES:
             raise UnknownName("clutch.gesture", self.gesture, GESTURES)
         for name in ("hold", "on", "off", "max_speed", "max_gap"):

@@ -14,6 +14,7 @@ from xop_lerobot.operator.clutch import ClutchConfig
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.raised_hands import RaisedHandsConfig
 from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS
+from xop_lerobot.yaml_words import fill_nulls, find_word
 
 HANDS = ("left", "right")
 GRIP_OPEN = 0.06
@@ -70,6 +71,7 @@ class DoublePinchConfig:
             UnknownName: If `hand` is no hand.
             BadValue: If a number is negative, or a pair is in the wrong order.
         """
+        fill_nulls(self)
         if self.hand not in HANDS:
             raise UnknownName("double_pinch.hand", self.hand, HANDS)
         for name, value in vars(self).items():
@@ -227,6 +229,9 @@ class GestureConfig:
             BadValue: If the window is not positive.
         """
         known = ("none", *CONSTRAINTS, *PRESETS)
+        self.both_double_pinch = find_word(self.both_double_pinch, known)
+        self.other_double_pinch = find_word(self.other_double_pinch, OTHER_PINCHES)
+        fill_nulls(self)
         if self.both_double_pinch not in known:
             raise UnknownName("gestures.both_double_pinch", self.both_double_pinch, known)
         if self.other_double_pinch not in OTHER_PINCHES:

@@ -12,6 +12,7 @@ from xop_lerobot.operator.display import Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.transforms import quat_from_yaw, quat_rotate
+from xop_lerobot.yaml_words import fill_nulls, find_word
 
 RAISED = ("left", "right", "both", "none")
 WRISTS = ("left_wrist", "right_wrist")
@@ -62,6 +63,9 @@ class RaisedHandsConfig:
             BadValue: If a number is not above 0, `on` is not below `off`, or the same hands
                 are raised for two things.
         """
+        for name in WISHES:
+            setattr(self, name, find_word(getattr(self, name), RAISED))
+        fill_nulls(self)
         hands = {name: getattr(self, name) for name in WISHES}
         for name, which in hands.items():
             if which not in RAISED:

@@ -14,6 +14,7 @@ from xop_lerobot.errors import XopError
 from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
 from xop_lerobot.state import FRAMES
 from xop_lerobot.transforms import quat_from_rpy
+from xop_lerobot.yaml_words import load_yaml
 
 SCRIPTS = Path(__file__).parent / "scripts"
 """Where the built-in scripts are."""
@@ -122,7 +123,7 @@ def load_script(name: str) -> Script:
         choices = ", ".join(list_scripts())
         raise BadScript(name, f"there is no such file. Built-in scripts: {choices}")
     try:
-        content = yaml.safe_load(path.read_text())
+        content = load_yaml(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
         fault = " ".join(str(error).split())
         raise BadScript(path, f"it is not readable YAML ({fault})") from error

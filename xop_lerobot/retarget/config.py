@@ -7,6 +7,7 @@ import os
 from dataclasses import dataclass, field, replace
 
 from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.yaml_words import fill_nulls, find_text
 
 WEIGHTINGS = ("raw", "minmax", "ess")
 SAMPLINGS = ("gaussian", "antithetic", "sobol")
@@ -227,6 +228,9 @@ class RetargeterConfig:
     obstacles: str = ""
 
     def __post_init__(self) -> None:
+        fill_nulls(self)
+        for name in ("variant", "targets", "body", "constraints", "obstacles"):
+            setattr(self, name, find_text(getattr(self, name)))
         if self.type not in RETARGETERS:
             raise UnknownName("retargeter", self.type, RETARGETERS)
         if self.preset not in PRESETS:

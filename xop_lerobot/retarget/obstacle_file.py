@@ -11,6 +11,7 @@ import numpy as np
 from xop_lerobot.errors import XopError
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.transforms import quat_from_rpy
+from xop_lerobot.yaml_words import load_yaml
 
 SIZES = {
     "box": ("size",),
@@ -39,7 +40,7 @@ def load_obstacles(path: str | Path) -> tuple[Obstacle, ...]:
     import yaml  # noqa: PLC0415 (only who has such a file needs it)
 
     try:
-        content = yaml.safe_load(Path(path).read_text())
+        content = load_yaml(Path(path).read_text())
     except OSError as error:
         raise BadObstacles(path, f"cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -97,7 +98,7 @@ def _parse(entry: Any, index: int) -> Obstacle:
             )
     rpy = _read_numbers(entry, "rpy", 3, "rad") if "rpy" in entry else np.zeros(3)
     return Obstacle(
-        name=str(entry.get("name", f"{shape}_{index + 1}")),
+        name=f"{shape}_{index + 1}" if entry.get("name") is None else str(entry["name"]),
         position=_read_numbers(entry, "position", 3, "m"),
         quat=quat_from_rpy(*rpy),
         half_size=half,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from xop_lerobot.dataset.collect_config import CollectConfig, import_plugins
 from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.yaml_words import load_yaml
 
 if TYPE_CHECKING:
     from lerobot_teleoperator_xop import XopConfig
@@ -164,7 +165,7 @@ def split_pairs(what: str, pairs: Sequence[str]) -> list[tuple[str, Any]]:
         if not equals:
             raise BadValue(f"{what} must be given as KEY=VALUE, got '{pair}'")
         try:
-            found.append((name.strip(), yaml.safe_load(text)))
+            found.append((name.strip(), load_yaml(text, switches=True)))
         except yaml.YAMLError as error:
             raise BadValue(f"{what} '{name}': '{text}' cannot be read") from error
     return found

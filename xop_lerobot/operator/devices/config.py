@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.yaml_words import fill_nulls
 
 
 @dataclass
@@ -67,6 +68,7 @@ class DeviceConfig:
             UnknownName: If `mode` is not a mode, with the known ones.
             BadValue: If a number is out of its range, with the range.
         """
+        fill_nulls(self)
         if self.mode is not None and self.mode.upper() not in Mode.__members__:
             raise UnknownName("device.mode", self.mode, (name.lower() for name in Mode.__members__))
         _check_at_least("device.episode", self.episode, 0)
