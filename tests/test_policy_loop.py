@@ -22,10 +22,12 @@ from xop_lerobot.low_level.policy import (
     make_policy,
 )
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
+from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.plant import Measurement, Plant
 from xop_lerobot.plant.policy_loop import ARM_MAX_SPEED, PolicyLoop, limit_action
 from xop_lerobot.plant.realtime_loop import RealtimeLoop
 from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.rollout import PolicyRollout
 
 RBY1: Morphology = make_morphology("rby1")
 SPACE = RBY1.command_space
@@ -490,6 +492,37 @@ def test_the_real_policy_takes_what_the_loop_gives():
         loop.execute(ask(v=1.0), 0.04)
     targets = loop.plant.applied[-1]
     assert (targets == -10.0).sum() == 2  # 1 m/s on wheels of 0.1 m
+
+
+class Strong(Echo):
+    """It was trained with motors of its own."""
+
+    name = "strong"
+
+    def adapt(self, model) -> None:
+        model.actuator_gainprm[:, 0] = 777.0
+
+    def act(self, qpos, qvel, command, arms, memory, mode) -> PolicyOutput:
+        return PolicyOutput(np.zeros((len(qpos), 29)), memory + 1)
+
+
+@pytest.mark.parametrize("kind", [PolicyLoop, RealtimeLoop])
+def test_a_plant_has_the_motors_of_the_policy_that_drives_it(kind):
+    plant = Simulation(G1)
+    before = plant.model.actuator_gainprm[:, 0].copy()
+    kind(G1, plant, Echo()).close()
+    np.testing.assert_array_equal(plant.model.actuator_gainprm[:, 0], before)
+    kind(G1, plant, Strong()).close()
+    assert (plant.model.actuator_gainprm[:, 0] == 777.0).all()
+
+
+def test_rollouts_have_the_motors_of_their_policy_and_the_model_keeps_its_own():
+    model = build_model(G1, "planning")
+    before = model.actuator_gainprm.copy()
+    rollout = PolicyRollout(model, Strong(), 1)
+    rollout.close()
+    assert (rollout.model.actuator_gainprm[:, 0] == 777.0).all()
+    np.testing.assert_array_equal(model.actuator_gainprm, before)
 
 
 @pytest.mark.parametrize(("robot", "ramps"), [("g1", False), ("rby1", True)])

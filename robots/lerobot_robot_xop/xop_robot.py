@@ -116,7 +116,6 @@ class XopRobot(Robot):
         from xop_lerobot.plant.realtime_loop import RealtimeLoop  # noqa: PLC0415
 
         self._plant = self._make_plant()
-        self._policy.adapt(self._plant.model)
         try:
             loop_class = RealtimeLoop if self._info.realtime else PolicyLoop
             self._loop = loop_class(self.morphology, self._plant, self._policy)

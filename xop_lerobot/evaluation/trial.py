@@ -268,7 +268,6 @@ def run_trial(
     setup = setup.resolved
     stage = make_stage(setup, seed)
     policy = make_policy(setup.low_level, setup.low_level_path or None)
-    policy.adapt(stage.plant.model)
     loop = PolicyLoop(stage.plant.morphology, stage.plant, policy)
     teleoperation = make_teleoperation(setup, seed, stage.plant.morphology)
     try:

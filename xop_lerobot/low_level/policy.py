@@ -43,9 +43,10 @@ class LowLevelPolicy(ABC):
     memory_size: int
 
     def adapt(self, model: mujoco.MjModel) -> None:
-        """Give `model`, of a plant, the motors that the policy was trained with.
+        """Give `model`, of a plant or of rollouts, the motors that the policy was trained with.
 
-        Nothing by default: the robots' models have the gains of their own policies.
+        `PolicyLoop` and `PolicyRollout` call it, so nobody else has to. Nothing by default: the
+        robots' models have the gains of their own policies.
         """
         del model
 

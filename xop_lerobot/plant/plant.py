@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from xop_lerobot.low_level.policy import LowLevelPolicy
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,13 @@ class Plant(ABC):
         Like `apply` for a body that cannot, or whose own controller does it.
         """
         self.apply(targets)
+
+    def adapt(self, policy: LowLevelPolicy) -> None:
+        """Take the motors that `policy` was trained with; `PolicyLoop` asks for it.
+
+        Nothing by default: a body of metal has the motors that it has.
+        """
+        del policy
 
     @abstractmethod
     def step(self, dt: float) -> None:

@@ -24,7 +24,7 @@ class PolicyLoop:
 
     Args:
         morphology: The robot.
-        plant: Its body.
+        plant: Its body; it takes the motors that the policy was trained with.
         policy: Its low-level policy.
 
     Attributes:
@@ -33,6 +33,7 @@ class PolicyLoop:
 
     def __init__(self, morphology: Morphology, plant: Plant, policy: LowLevelPolicy) -> None:
         self.morphology, self.plant, self.policy = morphology, plant, policy
+        plant.adapt(policy)
         self._memory = policy.initial_memory(1)
         self.action = _round_action(morphology.rest_action())
         self._previous: RobotAction | None = None  # executed before, while one is executed

@@ -21,6 +21,7 @@ from xop_lerobot.plant.sensors import Sensors
 from xop_lerobot.transforms import make_pose
 
 if TYPE_CHECKING:
+    from xop_lerobot.low_level.policy import LowLevelPolicy
     from xop_lerobot.morphology.morphology import ModelKind, Morphology
     from xop_lerobot.plant.viewer import Viewer
 
@@ -165,6 +166,11 @@ class Simulation(Plant):
         targets = check_vector("targets", targets, self.model.nu)
         with self._lock:
             self._ramp_to = targets
+
+    def adapt(self, policy: LowLevelPolicy) -> None:
+        """Give the simulated robot the motors that `policy` was trained with."""
+        with self._lock:
+            policy.adapt(self.model)
 
     def step(self, dt: float) -> None:
         """Simulate `dt` [s].

@@ -47,8 +47,8 @@ class PolicyRollout:
     The thread pool lives as long as the object; results do not depend on its size.
 
     Args:
-        model: Planning model.
-        policy: Low-level policy.
+        model: Planning model; it stays as it is.
+        policy: Low-level policy, whose own motors the rollouts have.
         num_threads: Threads of the physics.
 
     Raises:
@@ -59,6 +59,7 @@ class PolicyRollout:
         # MuJoCo would put a diverged sample back to its start, where it looks healthy.
         self.model, self.policy = copy.copy(model), policy
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        policy.adapt(self.model)
         self.substeps = round(POLICY_DT / model.opt.timestep)
         if abs(self.substeps * model.opt.timestep - POLICY_DT) > 1e-9:  # noqa: PLR2004
             raise BadValue(
