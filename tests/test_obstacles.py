@@ -8,15 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lerobot_robot_xop import XopG1, XopG1Config
+from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.retarget import factory
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs import CollisionCost
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.obstacle_file import BadObstacles, load_obstacles
 from xop_lerobot.retarget.obstacles import SHAPES, Obstacle, ObstacleSet, make_obstacles
+from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 from xop_lerobot.transforms import quat_exp, quat_from_rpy, quat_rotate
 
 BOX = Obstacle(
@@ -290,6 +295,65 @@ def test_a_file_that_is_not_there_or_no_yaml(tmp_path):
     assert str(raised.value) == expected
     with pytest.raises(BadObstacles, match="is no YAML"):
         load_obstacles(write(tmp_path, "obstacles: ["))
+
+
+BLIND = {
+    ("g1", "mpc"): "robot 'g1' keeps clear of nothing. Robots that do: rby1",
+    ("rby1", "direct"): "retargeter 'direct' keeps clear of nothing. Retargeters that do: mpc",
+}
+
+
+@pytest.mark.parametrize("robot, kind", BLIND)
+def test_a_file_that_would_be_ignored_is_refused(tmp_path, robot, kind):
+    morphology = make_morphology(robot)
+    config = RetargeterConfig(type=kind, threads=1, obstacles=write(tmp_path, FILE))
+    with pytest.raises(BadValue) as refusal:
+        make_retargeter(
+            config,
+            morphology,
+            make_policy(morphology.policies[0]),
+            build_model(morphology, "planning"),
+        )
+    text = f"obstacles '{config.obstacles}' would be ignored: {BLIND[robot, kind]}"
+    assert str(refusal.value) == text
+
+
+def test_it_is_refused_before_anything_is_recorded(tmp_path):
+    robot = XopG1(XopG1Config(session="obstacles", cameras=[]))
+    retargeter = RetargeterConfig(obstacles=write(tmp_path, FILE))
+    with pytest.raises(BadValue, match="robot 'g1' keeps clear of nothing. Robots that do: rby1"):
+        Xop(XopConfig(session="obstacles", retargeter=retargeter))
+    robot.disconnect()
+
+
+@pytest.mark.parametrize("robot, kind", BLIND)
+def test_a_scene_whose_obstacles_are_ignored_is_warned_of_once(caplog, robot, kind):
+    factory._warn_once.cache_clear()
+    morphology = make_morphology(robot)
+    for _ in range(2):
+        factory.warn_of_scene(kind, morphology, "room")
+        factory.warn_of_scene(kind, morphology, "empty")
+        factory.warn_of_obstacles(kind, morphology, "tabletop", 1)
+    count = len(make_obstacles(build_model(morphology, "full", scene="room")))
+    assert caplog.messages == [
+        f"{count} obstacles in scene 'room' ignored: {BLIND[robot, kind]}.",
+        f"1 obstacle in scene 'tabletop' ignored: {BLIND[robot, kind]}.",
+    ]
+
+
+def test_no_warning_where_they_are_kept_clear_of(caplog):
+    factory.warn_of_scene("mpc", make_morphology("rby1"), "room")
+    factory.warn_of_obstacles("mpc", make_morphology("rby1"), "room", 3)
+    assert caplog.messages == []
+
+
+def test_who_drives_a_g1_in_a_room_is_warned(caplog):
+    factory._warn_once.cache_clear()
+    morphology = make_morphology("g1")
+    info = RobotInfo("xop_g1", morphology, "default", None, "room", 25, 0)
+    config = TeleoperationConfig(retargeter=RetargeterConfig(type="direct"))
+    Teleoperation(config, info).disconnect()
+    assert "in scene 'room' ignored: retargeter 'direct' keeps clear of nothing" in caplog.text
 
 
 def test_a_file_adds_to_the_scene(tmp_path):

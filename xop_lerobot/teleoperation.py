@@ -36,7 +36,7 @@ from xop_lerobot.retarget.arm_driver import ArmDriver
 from xop_lerobot.retarget.changes import Change, Settings, make_toggle, parse_change
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
-from xop_lerobot.retarget.factory import make_retargeter
+from xop_lerobot.retarget.factory import make_retargeter, warn_of_obstacles, warn_of_scene
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.obstacle_file import load_obstacles
 from xop_lerobot.retarget.online import AppliedChange, OnlineSettings
@@ -88,11 +88,11 @@ class Teleoperation:
         self._settings = OnlineSettings(self.morphology, config.retargeter)
         model = build_model(self.morphology, "planning", scene=info.scene)
         policy = make_policy(info.low_level, info.low_level_path)
-        policy.adapt(model)
         obstacles: tuple[Obstacle, ...] | None = None
         if self.morphology.hull_points:  # the planning model holds the floor alone
             scene = build_model(self.morphology, "full", scene=info.scene)
             obstacles = make_obstacles(scene)
+        warn_of_scene(config.retargeter.type, self.morphology, info.scene)
         self.retargeter = make_retargeter(
             config.retargeter, self.morphology, policy, model, obstacles
         )
@@ -167,7 +167,11 @@ class Teleoperation:
 
         Those of the retargeter's own file of obstacles stay.
         """
-        if obstacles is None or not self.morphology.hull_points:
+        if obstacles is None:
+            return
+        kind, scene = self.config.retargeter.type, self.info.scene
+        warn_of_obstacles(kind, self.morphology, scene, len(obstacles))
+        if not self.morphology.hull_points:
             return
         path = self.config.retargeter.obstacles
         self._follower.set_obstacles(obstacles + (load_obstacles(path) if path else ()))

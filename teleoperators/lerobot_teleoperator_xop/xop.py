@@ -46,8 +46,8 @@ class Xop(Teleoperator):
 
     Raises:
         UnknownName: If there is no such device.
-        BadValue: If a setting of the device is out of its range or missing, or the operator's
-            calibration cannot be read.
+        BadValue: If a setting of the device is out of its range or missing, the operator's
+            calibration cannot be read, or obstacles are given that this robot would ignore.
     """
 
     config_class = XopConfig
@@ -68,6 +68,7 @@ class Xop(Teleoperator):
         # Refuses a bad device here, before a robot or a dataset exists.
         device = make_device(config.device)
         self._has_person = not device.self_engaging
+        self._check_obstacles()
         self._note_config()
         self.host = Host(
             config.session,
@@ -76,6 +77,14 @@ class Xop(Teleoperator):
         )
         self.host.install()
         weakref.finalize(self, self.host.remove)
+
+    def _check_obstacles(self) -> None:
+        """Refuse obstacles that would be ignored, if the robot is there already."""
+        if not (self.config.retargeter.obstacles and self.action_features):
+            return
+        from xop_lerobot.retarget.factory import check_obstacles  # noqa: PLC0415  brings MuJoCo
+
+        check_obstacles(self.config.retargeter, self._session.robot.morphology)
 
     @property
     def action_features(self) -> dict[str, type]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import logging
+
 import mujoco
 
+from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.policy import LowLevelPolicy
-from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.morphology import MORPHOLOGIES, Morphology, make_morphology
+from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.changes import make_settings
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.direct import DirectRetargeter
@@ -14,6 +19,66 @@ from xop_lerobot.retarget.obstacle_file import load_obstacles
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.retarget.presets import build_configs
+from xop_lerobot.wording import say_count
+
+logger = logging.getLogger(__name__)
+
+
+def explain_blindness(kind: str, morphology: Morphology) -> str:
+    """Say why a robot that is retargeted so keeps clear of nothing; empty if it does.
+
+    Args:
+        kind: Type of the retargeter.
+        morphology: The robot.
+    """
+    if kind != "mpc":
+        return f"retargeter {kind!r} keeps clear of nothing. Retargeters that do: mpc"
+    if not morphology.hull_points:
+        seeing = [name for name in MORPHOLOGIES if make_morphology(name).hull_points]
+        return (
+            f"robot {morphology.name!r} keeps clear of nothing. Robots that do: {', '.join(seeing)}"
+        )
+    return ""
+
+
+def check_obstacles(config: RetargeterConfig, morphology: Morphology) -> None:
+    """Check that a file of obstacles, if there is one, is heeded.
+
+    Raises:
+        BadValue: If it would be ignored, with what would heed it.
+    """
+    reason = explain_blindness(config.type, morphology) if config.obstacles else ""
+    if reason:
+        raise BadValue(f"obstacles '{config.obstacles}' would be ignored: {reason}")
+
+
+def warn_of_scene(kind: str, morphology: Morphology, scene: str) -> None:
+    """Warn, once, where what is fixed in a scene is no part of any plan.
+
+    Args:
+        kind: Type of the retargeter.
+        morphology: The robot.
+        scene: Name of the scene.
+    """
+    if explain_blindness(kind, morphology) and scene != "empty":
+        warn_of_obstacles(kind, morphology, scene, _count_obstacles(morphology.name, scene))
+
+
+def warn_of_obstacles(kind: str, morphology: Morphology, scene: str, count: int) -> None:
+    """Warn, once, where so many obstacles in a scene are no part of any plan."""
+    reason = explain_blindness(kind, morphology)
+    if reason and count:
+        _warn_once(f"{say_count(count, 'obstacle')} in scene {scene!r} ignored: {reason}.")
+
+
+@functools.cache
+def _count_obstacles(robot: str, scene: str) -> int:
+    return len(make_obstacles(build_model(make_morphology(robot), "full", scene=scene)))
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    logger.warning(text)
 
 
 def make_retargeter(
@@ -34,7 +99,9 @@ def make_retargeter(
 
     Raises:
         BadObstacles: If the file of obstacles is missing or malformed.
+        BadValue: If there is one, and robot or retargeter would ignore it.
     """
+    check_obstacles(config, morphology)
     if config.type == "direct":
         return DirectRetargeter(morphology, model, config.control_hz or 25.0)
     obstacles = make_obstacles(model) if obstacles is None else obstacles
