@@ -88,7 +88,7 @@ class AvpServer:
         for client in self._clients:
             client.put(message)
 
-    def wait_for_clients(self, number: int = 1, timeout: float = 20.0) -> None:
+    def wait_for_clients(self, number: int = 1, timeout: float = 120.0) -> None:
         wait_for(lambda: len(self._clients) >= number, timeout)
 
     def hang_up(self) -> None:
@@ -102,7 +102,7 @@ class AvpServer:
         self._server.stop(grace=0).wait()
 
 
-def wait_for(condition, timeout: float = 20.0) -> None:
+def wait_for(condition, timeout: float = 120.0) -> None:
     end = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < end, "it does not come"

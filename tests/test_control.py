@@ -57,14 +57,14 @@ def server(tmp_path, target):
 
 @pytest.fixture
 def client(server):
-    with ControlClient(server.path) as client:
+    with ControlClient(server.path, timeout=60) as client:
         yield client
 
 
 def send_raw(path: Path, data: bytes) -> tuple[dict, bytes]:
     """What comes back for raw bytes: the first answer, and what follows it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as raw:
-        raw.settimeout(10)
+        raw.settimeout(60)
         raw.connect(str(path))
         raw.sendall(data)
         with raw.makefile("rb") as lines:

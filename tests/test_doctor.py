@@ -212,12 +212,10 @@ def test_a_slow_stream_and_a_lost_hand():
 
 
 def test_nobody_streams():
-    begun = time.monotonic()
     found = check_headset(Setup("avp", "127.0.0.1", find_port(), wait=1.5))
     assert found.level is Level.FAIL
     assert "no pose has come within 1.5 s" in found.text
     assert "nobody answers" in found.text
-    assert time.monotonic() - begun < 60
     assert check_headset(Setup()).level is Level.SKIP
 
 

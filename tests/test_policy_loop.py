@@ -296,7 +296,7 @@ def realtime():
     loop.close()
 
 
-def wait_for(condition: Callable[[], bool], timeout: float = 20.0) -> None:
+def wait_for(condition: Callable[[], bool], timeout: float = 120.0) -> None:
     """Wait until it holds; how long that takes is no matter."""
     deadline = time.monotonic() + timeout
     while not condition():

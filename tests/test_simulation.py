@@ -585,7 +585,7 @@ def test_browser_view_follows_the_simulation(
     viewer = simulation._viewer
     assert isinstance(viewer, BrowserViewer)
     assert f"The simulation can be watched at {viewer.url}" in capsys.readouterr().out
-    assert b"<html" in urllib.request.urlopen(viewer.url, timeout=10).read().lower()
+    assert b"<html" in urllib.request.urlopen(viewer.url, timeout=60).read().lower()
 
     names = {simulation.model.body(body).name for body in viewer.body_ids}
     assert names == {"base", "upper", "hand"}

@@ -164,11 +164,14 @@ def test_huge_messages_are_not_even_read(device, size):
     assert page.wait_until_closed()[0] in {1009, 1006}
 
 
-def test_too_many_messages(device):
+def test_too_many_messages(device, monkeypatch):
     limit = RateLimit()
     assert not any(limit.is_broken(0.5) for _ in range(400))
     assert limit.is_broken(1.0)
     assert not limit.is_broken(1.6)
+    count = RateLimit.is_broken
+    # All within one second, however slow the machine is.
+    monkeypatch.setattr(RateLimit, "is_broken", lambda limit, time: count(limit, 0.0))
     page = Page(device)
     page.wait_for("ping")
     with contextlib.suppress(ConnectionClosed):  # as soon as it is shut out
@@ -182,7 +185,7 @@ def test_too_many_messages(device):
 
 
 def ask(device: WebXrDevice, path: str, method: str = "GET") -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection("localhost", device.port, timeout=20)
+    connection = http.client.HTTPConnection("localhost", device.port, timeout=120)
     connection.request(method, path)
     return connection.getresponse()
 
@@ -211,13 +214,13 @@ def test_pages(device):
 
 def test_connections_that_ask_nothing_are_ended(device, monkeypatch):
     monkeypatch.setattr(connections, "FIRST_REQUEST_S", 0.05)
-    with socket.create_connection(("localhost", device.port), timeout=20) as idle:
+    with socket.create_connection(("localhost", device.port), timeout=120) as idle:
         idle.sendall(b"GET / HT")
         with pytest.raises((ConnectionResetError, AssertionError)):
             assert idle.recv(100) != b""
     monkeypatch.setattr(connections, "FIRST_REQUEST_S", 60.0)
     crowd = [socket.create_connection(("localhost", device.port)) for _ in range(200)]
-    crowd[-1].settimeout(20)
+    crowd[-1].settimeout(120)
     assert crowd[-1].recv(100) == b""  # there was no room for it
     for each in crowd:
         each.close()
@@ -308,10 +311,10 @@ def test_tls(tmp_path, monkeypatch):
         trusting = ssl.create_default_context(cafile=str(device.certificate.path))
         for host in ("localhost", "127.0.0.1"):
             url = f"https://{host}:{device.port}/cert"
-            with urllib.request.urlopen(url, context=trusting, timeout=20) as reply:
+            with urllib.request.urlopen(url, context=trusting, timeout=120) as reply:
                 assert reply.read() == device.certificate.path.read_bytes()
         with pytest.raises(urllib.error.URLError, match="self-signed certificate"):
-            urllib.request.urlopen(device.url, context=ssl.create_default_context(), timeout=20)
+            urllib.request.urlopen(device.url, context=ssl.create_default_context(), timeout=120)
         page = Page(device)
         page.wait_for("ping")
         send(page, device, make_person(0.0), 1)

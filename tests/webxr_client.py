@@ -83,7 +83,7 @@ class Page:
             f"{device.url.replace('http', 'ws', 1)}ws?code={code}&role={role}",
             ssl=tls,
             origin=origin,  # type: ignore[arg-type]
-            open_timeout=20,
+            open_timeout=120,
             proxy=None,
         )
         self._thread = threading.Thread(target=self._listen, daemon=True)
@@ -114,7 +114,7 @@ class Page:
         return self.of_type(kind)[-1]
 
     def wait_until_closed(self) -> tuple[int | None, str]:
-        self._thread.join(timeout=20)
+        self._thread.join(timeout=120)
         assert not self._thread.is_alive()
         return self.ws.close_code, self.ws.close_reason or ""
 
@@ -123,4 +123,4 @@ class Page:
 
     def close(self) -> None:
         self.ws.close()
-        self._thread.join(timeout=20)
+        self._thread.join(timeout=120)
