@@ -32,7 +32,12 @@ from xop_lerobot.dataset.facts import compute_config_hash, read_facts
 from xop_lerobot.dataset.record import build_features
 from xop_lerobot.dataset.shutdown import hold_signals
 from xop_lerobot.dataset.video_queue import MAX_IMAGES, VideoQueue
-from xop_lerobot.dataset.xop_dataset import DatasetExists, WrongFps, XopDataset
+from xop_lerobot.dataset.xop_dataset import (
+    BatchedEncoding,
+    DatasetExists,
+    WrongFps,
+    XopDataset,
+)
 from xop_lerobot.errors import BadValue, LinkError, XopError
 from xop_lerobot.link import Outcome, TickRecord, get_session
 from xop_lerobot.operator.frame import OperatorFrame
@@ -393,6 +398,22 @@ def test_wrong_fps(session, pair, tmp_path):
         "must be equal. Use --dataset.fps=25"
     )
     assert not (tmp_path / "data").exists()
+
+
+def test_videos_are_not_encoded_in_batches(session, pair, tmp_path):
+    """A batch is encoded after its episodes are saved: whoever stops in between loses pictures."""
+    root = tmp_path / "data"
+    with pytest.raises(BatchedEncoding) as error:
+        create(session, pair[0], root, batch_encoding_size=2)
+    assert str(error.value) == (
+        "--dataset.video_encoding_batch_size must be 1, got 2: an episode is saved with its "
+        "videos, so that what happens later can't take them. To save sooner, use "
+        "--dataset.streaming_encoding=true"
+    )
+    assert not root.exists()
+    with pytest.raises(BatchedEncoding):
+        XopDataset.bind(session).resume("local/toy", root=root, batch_encoding_size=3)
+    assert not root.exists()
 
 
 def test_no_robot(session, tmp_path):

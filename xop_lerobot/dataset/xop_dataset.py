@@ -68,6 +68,17 @@ class WrongFps(XopError, ValueError):
         )
 
 
+class BatchedEncoding(XopError, ValueError):
+    """Videos should be encoded later than their episodes are saved."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__(
+            f"--dataset.video_encoding_batch_size must be 1, got {size}: an episode is saved with "
+            "its videos, so that what happens later can't take them. To save sooner, use "
+            "--dataset.streaming_encoding=true"
+        )
+
+
 class XopDataset(LeRobotDataset):
     """LeRobotDataset plus operator, goal, retargeter and robot columns.
 
@@ -105,9 +116,11 @@ class XopDataset(LeRobotDataset):
         Raises:
             LinkError: If the session has no robot, or more than one.
             WrongFps: If the robot runs at another rate.
+            BatchedEncoding: If videos should be encoded later than their episodes are saved.
             DatasetExists: If the directory is there already.
         """
         info = get_session(cls.session_name).robot
+        _check_encoding(options)
         if fps != info.fps:
             raise WrongFps(info.fps, fps)
         folder = Path(root) if root else HF_LEROBOT_HOME / repo_id
@@ -131,9 +144,11 @@ class XopDataset(LeRobotDataset):
         Raises:
             LinkError: If the session has no robot, or more than one.
             WrongFps: If the robot runs at another rate.
+            BatchedEncoding: If videos should be encoded later than their episodes are saved.
             BadValue: If its columns are those of another version.
         """
         info = get_session(cls.session_name).robot
+        _check_encoding(options)
         dataset = cast("Self", super().resume(repo_id, root=root, **options))
         if dataset.fps != info.fps:
             raise WrongFps(info.fps, dataset.fps)
@@ -370,6 +385,20 @@ class XopDataset(LeRobotDataset):
             changes=json.dumps(tally.changes),
             late=info.realtime and tally.frames > 1 and tally.fps < _LATE * info.fps,
         )
+
+
+def _check_encoding(options: Mapping[str, Any]) -> None:
+    """Refuse LeRobot's batches of videos, which are encoded after their episodes are saved.
+
+    Each episode has files of its own here, closed when it is saved; a batch would look for the
+    rows of all its episodes in one of them, and a killed process would lose its pictures.
+
+    Raises:
+        BatchedEncoding: If a batch is larger than one episode.
+    """
+    size = options.get("batch_encoding_size", 1)
+    if size > 1:
+        raise BatchedEncoding(size)
 
 
 _KEPT = (
