@@ -19,11 +19,13 @@ import pytest
 import toy_robot  # noqa: F401  registers the toy
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts.lerobot_record import RecordConfig
+from lerobot.utils.keyboard_input import apply_recording_control
 
 from xop_lerobot.command import Mode
 from xop_lerobot.control.client import ControlClient
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.dataset.record import XopRecordConfig
+from xop_lerobot.dataset.xop_dataset import XopDataset
 from xop_lerobot.errors import XopError
 from xop_lerobot.link import get_session
 
@@ -95,6 +97,24 @@ def test_resuming_from_the_command_line(recorded, tmp_path, monkeypatch):
     run(monkeypatch, "lerobot-record", *flags, "--resume=true")
     assert [row["episode_index"] for row in read_facts(root)] == [0, 1]
     assert LeRobotDataset("local/toy", root=root).num_episodes == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["lerobot-record", "xop-record"])
+def test_a_key_pressed_twice(tmp_path, monkeypatch, command):
+    """The second press comes while the episode is saved; the session goes on with whole ones."""
+    save = XopDataset.save_episode
+
+    def save_and_press(self: XopDataset, *args, **kwargs) -> None:
+        events = self._events
+        save(self, *args, **kwargs)
+        apply_recording_control("right", events)
+
+    monkeypatch.setattr(XopDataset, "save_episode", save_and_press)
+    root = tmp_path / "data"
+    flags = [*ROBOT, *TELEOP, *record_flags(root, num_episodes=3), "--play_sounds=false"]
+    run(monkeypatch, command, *flags)
+    assert [row["length"] for row in read_facts(root)] == [10, 10, 10]
 
 
 @pytest.mark.slow

@@ -111,6 +111,10 @@ class Recorder(Protocol):
         """Take note that the pause after an episode begins, with the events of its loop."""
         ...
 
+    def forget_presses(self) -> None:
+        """Forget the keys that were pressed before the robot stood ready for the episode."""
+        ...
+
 
 class Session:
     """One robot and one teleoperator.
@@ -176,6 +180,8 @@ class Session:
         """Count a reset that the robot has done, and forget what was before it."""
         self._forget()
         self.reset_count += 1
+        if self.recorder is not None:
+            self.recorder.forget_presses()
 
     def ask(self, wish: Wish) -> tuple[Cue, str]:
         """Ask the recorder for `wish`; return what the operator is told."""

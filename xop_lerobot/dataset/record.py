@@ -95,8 +95,8 @@ class Recording:
 
     def run(self) -> None:
         """Record the episodes that `config` asks for."""
-        recorded = 0
-        while recorded < self.config.dataset.num_episodes and not self.events["stop_recording"]:
+        wanted = self.dataset.num_episodes + self.config.dataset.num_episodes
+        while self.dataset.num_episodes < wanted and not self.events["stop_recording"]:
             log_say(f"Recording episode {self.dataset.num_episodes}", self.config.play_sounds)
             self.run_episode()
             if self.events["rerecord_episode"]:
@@ -104,7 +104,6 @@ class Recording:
                 self.dataset.clear_episode_buffer()
                 continue
             self.dataset.save_episode()
-            recorded += 1
 
     def run_episode(self) -> None:
         """Record one episode, until its time, its end, its success or a key."""
@@ -118,11 +117,11 @@ class Recording:
         start = time.perf_counter()
         while not self.events["exit_early"]:
             tick_start = time.perf_counter()
-            if self.realtime and tick_start - start >= duration:
-                break
             self.run_tick()
             if self.realtime or config.pace:
                 precise_sleep(max(0.0, tick_start + 1 / fps - time.perf_counter()))
+            if self.realtime and time.perf_counter() - start >= duration:
+                break
         self.events["exit_early"] = False
 
     def run_tick(self) -> None:

@@ -233,6 +233,19 @@ class XopDataset(LeRobotDataset):
         self._events, self._tick_limit = events, tick_limit
         self._stop_on_success, self._paused = stop_on_success, False
         self._session.recorder = self
+        self.forget_presses()
+
+    def forget_presses(self) -> None:
+        """Forget keys that were pressed while the last episode was saved or the robot started over.
+
+        Saving takes a second in which nothing seems to happen, so people press again; what they
+        mean is the episode that they have seen. Only Esc still counts: it ends the session, and
+        an episode without a frame is left out.
+        """
+        if self._tally.frames or not self._events:
+            return
+        stops = self._events.get("stop_recording", False)
+        self._events["exit_early"] = self._events["rerecord_episode"] = stops
 
     def pause(self, events: MutableMapping[str, bool]) -> None:
         """Say that the pause after an episode begins, in which that can still be discarded."""
@@ -294,7 +307,14 @@ class XopDataset(LeRobotDataset):
     def save_episode(
         self, episode_data: dict | None = None, parallel_encoding: bool = True
     ) -> None:
-        """Save the episode so that it survives a crash, and ask the robot to start over."""
+        """Save the episode so that it survives a crash, and ask the robot to start over.
+
+        One without a frame is none, and is not saved.
+        """
+        if episode_data is None and not self.has_pending_frames():
+            if self._events:  # else none has begun: LeRobot's rollouts save once more at their end
+                logger.warning("Episode %d has no frame; it is not saved.", self.num_episodes)
+            return
         facts, index = self._collect_facts(), self.num_episodes
         if not self._info.realtime and facts.dropped_frames:
             raise XopError(
@@ -345,7 +365,7 @@ class XopDataset(LeRobotDataset):
             shutil.rmtree(self.root, ignore_errors=True)
 
     def _begin_next(self, index: int) -> None:
-        self._tally = Tally()
+        self._tally, self._events = Tally(), {}
         self._session.progress = None
         self._session.begin_episode(index)
 
