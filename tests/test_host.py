@@ -17,15 +17,19 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
 from lerobot.rollout import context as rollout_module
+from lerobot.rollout.strategies.episodic import EpisodicStrategy
 from lerobot.scripts import lerobot_record as record_module
 from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot.teleoperators.teleoperator import Teleoperator
+from lerobot.utils.keyboard_input import apply_recording_control
+from test_dataset import STREAMING, tick
 from toy_robot import SMALL, XopToyConfig, make_teleop, make_toy
 
-from xop_lerobot.dataset import host
+from xop_lerobot.dataset import host, rollout_loop
 from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.dataset.record import build_features
 from xop_lerobot.dataset.xop_dataset import DatasetExists, WrongFps, XopDataset
-from xop_lerobot.errors import LinkError
+from xop_lerobot.errors import BadValue, LinkError
 
 STOCK_DATASET, STOCK_LOOP = LeRobotDataset, record_module.record_loop
 
@@ -243,7 +247,7 @@ def test_a_slow_lockstep_loop_is_not_complained_of(session, tmp_path, monkeypatc
         said.append(control_time_s)
 
     wrapped = teleop.host._wrap_loop(loop)
-    dataset = types.SimpleNamespace(begin=lambda events, limit: said.append(limit))
+    dataset = types.SimpleNamespace(fps=25, begin=lambda events, limit: said.append(limit))
     wrapped(robot=robot, events={}, fps=25, dataset=dataset, control_time_s=2)
     assert said == [50, math.inf]
     assert [record.message for record in caplog.records] == ["something else"]
@@ -304,3 +308,182 @@ def test_if_lerobot_has_moved_it_is_left_alone(
 
 def test_this_lerobot_has_no_fault():
     assert host.find_fault([record_module, rollout_module]) == ""
+    assert rollout_loop.find_strategy() == (EpisodicStrategy, "")
+
+
+# LeRobot after 0.6.1: the loops have a timer and no rate, and the timer complains of slow ticks.
+
+
+def next_record_loop(robot, events, timer, dataset=None, teleop=None, control_time_s=None):
+    """LeRobot's next `record_loop`, reduced to what it is called with and how it ends."""
+    timer.run(robot, teleop, events, dataset, control_time_s)
+
+
+class NextStrategy:
+    """LeRobot's next `EpisodicStrategy`; `timer` runs the loop with `driver` as the policy."""
+
+    driver = None
+
+    def _policy_loop(
+        self, ctx, robot, events, features, timer, control_time_s, dataset, single_task
+    ):
+        timer.run(robot, self.driver, events, dataset, control_time_s)
+
+
+class NextTimer:
+    """Stands for LeRobot's next `CycleTimer`, on a clock on which every tick is far too slow."""
+
+    def __init__(self, presses: tuple[int, ...] = ()) -> None:
+        self._presses = presses
+
+    def run(self, robot, teleop, events, dataset, control_time_s) -> None:
+        elapsed, frame = 0.0, 0
+        while elapsed < control_time_s and not events["exit_early"]:
+            tick(robot, teleop, dataset)
+            warner = logging.getLogger("lerobot.utils.cycle_timer")
+            warner.warning("Control loop is running slower (1.0 Hz) than the target FPS (25 Hz).")
+            elapsed, frame = elapsed + 1.0, frame + 1
+            events["exit_early"] |= frame in self._presses
+        events["exit_early"] = False
+
+
+def make_events() -> dict[str, bool]:
+    return dict.fromkeys(("exit_early", "rerecord_episode", "stop_recording"), False)
+
+
+@pytest.fixture
+def recording(session, tmp_path):
+    """A connected pair and its dataset."""
+    robot, teleop = make_toy(session), make_teleop(session)
+    teleop.connect()
+    robot.connect()
+    features = build_features(robot, use_videos=True)
+    bound = XopDataset.bind(session)
+    dataset = bound.create("local/toy", 25, features, root=tmp_path / "data", **STREAMING)
+    yield robot, teleop, dataset
+    dataset.finalize()
+    teleop.disconnect()
+    robot.disconnect()
+
+
+def test_the_next_record_loop_ends_by_frames(recording, caplog):
+    robot, teleop, dataset = recording
+    loop = teleop.host._wrap_loop(next_record_loop)
+    events = make_events()
+    loop(robot, events, NextTimer(), dataset=dataset, teleop=teleop, control_time_s=0.2)
+    dataset.save_episode()
+    assert [row["length"] for row in read_facts(dataset.root)] == [5]
+    assert "slower" not in caplog.text
+
+
+def test_the_next_rollouts_end_by_frames(session, recording, monkeypatch, caplog):
+    robot, teleop, dataset = recording
+    monkeypatch.setattr(NextStrategy, "driver", teleop)
+    teleop.host.remove()
+    stock = NextStrategy._policy_loop
+    with monkeypatch.context() as patch:
+        patch.setattr("lerobot.rollout.strategies.episodic.EpisodicStrategy", NextStrategy)
+        teleop.host.install()
+        assert NextStrategy._policy_loop is not stock
+        NextStrategy()._policy_loop(
+            ctx=None, robot=robot, events=make_events(), features={}, timer=NextTimer(),
+            control_time_s=0.2, dataset=dataset, single_task="play",
+        )  # fmt: skip
+        dataset.save_episode()
+        teleop.host.remove()
+    assert NextStrategy._policy_loop is stock
+    assert [row["length"] for row in read_facts(dataset.root)] == [5]
+    assert "slower" not in caplog.text
+    assert "LeRobot has changed" not in caplog.text
+
+
+class NoLoop:
+    pass
+
+
+class OtherLoop:
+    def _policy_loop(self, events, dataset, seconds):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("strategy", "fault"),
+    [
+        (None, "lerobot.rollout.strategies.episodic has no EpisodicStrategy"),
+        (NoLoop, "EpisodicStrategy has no _policy_loop()"),
+        (OtherLoop, "EpisodicStrategy._policy_loop() has no parameter control_time_s"),
+    ],
+)
+def test_a_rollout_that_cannot_be_held_to_its_length_says_so(
+    session, monkeypatch, caplog, strategy, fault
+):
+    with monkeypatch.context() as patch:
+        patch.setattr("lerobot.rollout.strategies.episodic.EpisodicStrategy", strategy)
+        teleop = make_teleop(session)
+        # The columns are recorded all the same.
+        assert issubclass(rollout_module.LeRobotDataset, XopDataset)
+        teleop.disconnect()
+    assert (
+        f"LeRobot has changed ({fault}), so a lock-step episode of lerobot-rollout ends by the "
+        "wall clock." in caplog.text
+    )
+
+
+def test_lockstep_takes_no_actions_between_the_policys(session, recording):
+    _, _, dataset = recording
+    loop = rollout_loop.count_in_frames(NextStrategy._policy_loop, session)
+    strategy = types.SimpleNamespace(_interpolator=types.SimpleNamespace(multiplier=2))
+    with pytest.raises(BadValue) as refusal:
+        loop(
+            strategy, ctx=None, robot=None, events=make_events(), features={}, timer=None,
+            control_time_s=1, dataset=dataset, single_task="play",
+        )  # fmt: skip
+    assert str(refusal.value) == (
+        "--interpolation_multiplier must be 1 with a robot in lock-step, got 2: each action that "
+        "is sent takes 1/25 s. Use --robot.clock=realtime for more"
+    )
+
+
+# Keys that are pressed again while an episode is saved.
+
+
+@pytest.mark.parametrize("key", ["right", "left"])
+def test_a_key_that_is_pressed_again_is_not_for_the_next_episode(recording, key):
+    """The second press comes while the first episode is saved, the third while the robot resets."""
+    robot, teleop, dataset = recording
+    loop = teleop.host._wrap_loop(next_record_loop)
+    events, start = make_events(), robot._start_episode
+
+    def run(*presses: int) -> None:
+        loop(robot, events, NextTimer(presses), dataset=dataset, teleop=teleop, control_time_s=0.4)
+
+    run(3)
+    dataset.save_episode()
+    apply_recording_control(key, events)
+    robot._start_episode = lambda: (apply_recording_control(key, events), start())
+    run()
+    assert events == make_events()
+    dataset.save_episode()
+    assert [row["length"] for row in read_facts(dataset.root)] == [3, 10]
+
+
+def test_esc_counts_whenever_it_is_pressed(recording):
+    """Also while the robot resets; the episode that has not begun is left out."""
+    robot, teleop, dataset = recording
+    loop = teleop.host._wrap_loop(next_record_loop)
+    events, start = make_events(), robot._start_episode
+    robot._start_episode = lambda: (apply_recording_control("esc", events), start())
+    loop(robot, events, NextTimer(), dataset=dataset, teleop=teleop, control_time_s=9)
+    assert (events["stop_recording"], events["rerecord_episode"]) == (True, True)
+
+
+def test_an_episode_without_a_frame_is_not_saved(recording, caplog):
+    _, _, dataset = recording
+    dataset.save_episode()  # as LeRobot's rollouts do at their end
+    assert not caplog.records
+    dataset.begin(make_events(), 9)
+    dataset.save_episode()
+    assert dataset.num_episodes == 0
+    assert [record.message for record in caplog.records] == [
+        "Episode 0 has no frame; it is not saved."
+    ]

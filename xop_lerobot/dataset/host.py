@@ -52,8 +52,12 @@ _META_SIGNATURES = {
         "episode_metadata",
     ),
 }
-_LOOP_PARAMETERS = ("robot", "events", "fps", "dataset", "teleop", "control_time_s")
+_LOOP_PARAMETERS = ("robot", "events", "dataset", "teleop", "control_time_s")
 """Parameters of `record_loop` that the replacement reads or changes."""
+_SLOWNESS = "loop is running slower"
+"""Of LeRobot's warning of a slow tick: of the "Record loop", later of the "Control loop"."""
+_WARNERS = (None, "lerobot.rollout.strategies.episodic", "lerobot.utils.cycle_timer")
+"""Loggers that may give it, by LeRobot's version and command; None is the root."""
 
 
 class Host:
@@ -102,15 +106,23 @@ class Host:
             self._terminator.install()
 
     def _hold_policies_to_length(self) -> None:
-        """Let `lerobot-rollout` count frames too, where its loop is as it was."""
+        """Let `lerobot-rollout`, if it runs, count frames too, where its loop is as expected."""
         from xop_lerobot.dataset import rollout_loop  # noqa: PLC0415  brings torch
 
-        strategy = rollout_loop.find_strategy(find(rollout_loop.STRATEGY_MODULE))
-        if strategy is not None:
-            loop = getattr(strategy, rollout_loop.LOOP)
-            stock = getattr(loop, "xop_stock", loop)
-            ours = rollout_loop.count_in_frames(stock, self._session)
-            self._replace(strategy, rollout_loop.LOOP, ours)
+        if find(ROLLOUT_MODULE) is None:
+            return
+        strategy, fault = rollout_loop.find_strategy()
+        if strategy is None:
+            logger.warning(
+                "LeRobot has changed (%s), so a lock-step episode of lerobot-rollout ends by the "
+                "wall clock. Use the LeRobot version that this release was made for.",
+                fault,
+            )
+            return
+        loop = getattr(strategy, rollout_loop.LOOP)
+        stock = getattr(loop, "xop_stock", loop)
+        ours = rollout_loop.count_in_frames(stock, self._session)
+        self._replace(strategy, rollout_loop.LOOP, ours)
 
     def remove(self) -> None:
         """Put LeRobot's own names back; may be called twice."""
@@ -144,7 +156,8 @@ class Host:
                 if dataset is None and recorder is not None:
                     recorder.pause(call["events"])
                 if dataset is not None and lockstep:
-                    dataset.begin(call["events"], count_ticks(call["control_time_s"], call["fps"]))
+                    ticks = count_ticks(call["control_time_s"], dataset.fps)
+                    dataset.begin(call["events"], ticks)
                     call["control_time_s"] = math.inf
                 elif dataset is not None:
                     dataset.begin(call["events"], None)
@@ -166,22 +179,20 @@ class Host:
 
 
 @contextmanager
-def without_slowness(speaker: str | None = None) -> Iterator[None]:
-    """Leave out LeRobot's warning of every slow tick: in lock-step none is wrong, only later.
-
-    Args:
-        speaker: Name of the logger that warns; None for the root.
-    """
+def without_slowness() -> Iterator[None]:
+    """Leave out LeRobot's warning of every slow tick: in lock-step none is wrong, only later."""
 
     def is_other(record: logging.LogRecord) -> bool:
-        return not str(record.msg).startswith("Record loop is running slower")
+        return _SLOWNESS not in str(record.msg)
 
-    warner = logging.getLogger(speaker)
-    warner.addFilter(is_other)
+    warners = [logging.getLogger(name) for name in _WARNERS]
+    for warner in warners:
+        warner.addFilter(is_other)
     try:
         yield
     finally:
-        warner.removeFilter(is_other)
+        for warner in warners:
+            warner.removeFilter(is_other)
 
 
 def count_ticks(duration: float, fps: int) -> int:

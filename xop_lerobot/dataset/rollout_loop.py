@@ -2,36 +2,48 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from xop_lerobot.dataset.host import count_ticks, without_slowness
 from xop_lerobot.dataset.xop_dataset import XopDataset
+from xop_lerobot.errors import BadValue
 from xop_lerobot.link import get_session
 
-if TYPE_CHECKING:
-    from types import ModuleType
-
 STRATEGY_MODULE = "lerobot.rollout.strategies.episodic"
+STRATEGY = "EpisodicStrategy"
 LOOP = "_policy_loop"
-_PARAMETERS = ("self", "robot", "events", "fps", "dataset", "control_time_s")
-"""Parameters of the loop that the replacement reads or changes."""
+_PARAMETERS = ("self", "events", "dataset", "control_time_s")
+"""Parameters of the loop that the replacement reads or changes, in 0.6.1 and after it."""
 
 
-def find_strategy(module: ModuleType | None) -> type | None:
-    """Return LeRobot's strategy that records policies in episodes, if it is as expected here.
+def find_strategy() -> tuple[type | None, str]:
+    """Return LeRobot's strategy that records policies in episodes, and what is wrong with it.
 
-    Where it is not, episodes end by the wall clock, as LeRobot has it: nothing is lost but the
+    Where something is, episodes end by the wall clock, as LeRobot has it: nothing is lost but the
     same number of frames whatever the machine does meanwhile.
+
+    Returns:
+        The strategy and an empty text, or None and what is not as this module expects it.
     """
-    strategy = getattr(module, "EpisodicStrategy", None)
+    try:
+        module = importlib.import_module(STRATEGY_MODULE)
+    except ImportError:
+        return None, f"it has no {STRATEGY_MODULE}"
+    strategy = getattr(module, STRATEGY, None)
+    if strategy is None:
+        return None, f"{STRATEGY_MODULE} has no {STRATEGY}"
     loop = getattr(strategy, LOOP, None)
-    if strategy is None or loop is None:
-        return None
+    if loop is None:
+        return None, f"{STRATEGY} has no {LOOP}()"
     known = inspect.signature(getattr(loop, "xop_stock", loop)).parameters
-    return strategy if all(name in known for name in _PARAMETERS) else None
+    missing = [name for name in _PARAMETERS if name not in known]
+    if missing:
+        return None, f"{STRATEGY}.{LOOP}() has no parameter {', '.join(missing)}"
+    return strategy, ""
 
 
 def count_in_frames(stock: Callable[..., None], session: str) -> Callable[..., None]:
@@ -47,13 +59,31 @@ def count_in_frames(stock: Callable[..., None], session: str) -> Callable[..., N
         """Run LeRobot's loop; the episode's time passes on the robot's clock."""
         call = signature.bind(*args, **kwargs).arguments
         dataset = call["dataset"]
-        is_ours = isinstance(dataset, XopDataset) and dataset.session_name == session
-        if is_ours and not get_session(session).robot.realtime:
-            dataset.begin(call["events"], count_ticks(call["control_time_s"], call["fps"]))
-            call["control_time_s"] = math.inf
-            with without_slowness(STRATEGY_MODULE):
-                stock(**call)
+        if not isinstance(dataset, XopDataset) or dataset.session_name != session:
+            stock(**call)
             return
-        stock(**call)
+        if get_session(session).robot.realtime:
+            dataset.begin(call["events"], None)
+            stock(**call)
+            return
+        _check_multiplier(call["self"], dataset.fps)
+        dataset.begin(call["events"], count_ticks(call["control_time_s"], dataset.fps))
+        call["control_time_s"] = math.inf
+        with without_slowness():
+            stock(**call)
 
     return policy_loop
+
+
+def _check_multiplier(strategy: object, fps: int) -> None:
+    """Check that each action of the policy is sent once.
+
+    Raises:
+        BadValue: If LeRobot sends actions between them: each moves a lock-step robot by a tick.
+    """
+    multiplier = getattr(getattr(strategy, "_interpolator", None), "multiplier", 1)
+    if multiplier != 1:
+        raise BadValue(
+            f"--interpolation_multiplier must be 1 with a robot in lock-step, got {multiplier}: "
+            f"each action that is sent takes 1/{fps} s. Use --robot.clock=realtime for more"
+        )
