@@ -22,6 +22,8 @@ from typing import Any
 FACTS_DIR = Path("meta") / "xop"
 EPISODES_FILE = FACTS_DIR / "episodes.jsonl"
 CONFIG_FILE = FACTS_DIR / "config.json"
+CONFIGS_DIR = FACTS_DIR / "configs"
+"""Every configuration by its hash, where the episodes differ in it."""
 FACTS_PREFIX = "xop/"
 _JSON_FACTS = ("versions", "settings", "changes")
 _PACKAGES = ("lerobot_teleoperator_xop", "lerobot", "mujoco", "mink", "numpy", "onnxruntime")
@@ -93,6 +95,8 @@ def append_facts(
 ) -> None:
     """Add the line of `episode`, which has `length` frames, and see it on the disk.
 
+    A line that a crash cut off is ended first, so that it takes no other along.
+
     Args:
         root: Directory of the dataset.
         episode: Index of the episode.
@@ -106,8 +110,12 @@ def append_facts(
     row |= more
     path = root / EPISODES_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")
+    with path.open("a+b") as file:
+        if file.tell():
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                file.write(b"\n")
+        file.write(json.dumps(row).encode() + b"\n")
         file.flush()
         os.fsync(file.fileno())
 
@@ -129,6 +137,29 @@ def write_config(root: Path, config: Mapping[str, Any]) -> None:
     path = root / CONFIG_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(to_plain(config), indent=2) + "\n", encoding="utf-8")
+
+
+def keep_config(root: Path, config: Mapping[str, Any]) -> None:
+    """Keep the configuration of a session beside those that the dataset has.
+
+    `meta/xop/config.json` is that of the first session. Where another one's differs, both are in
+    `meta/xop/configs/`, by the hash that the facts name.
+    """
+    path = root / CONFIG_FILE
+    if not path.exists():
+        write_config(root, config)
+        return
+    try:
+        first = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        first = {}
+    if compute_config_hash(first) == compute_config_hash(config):
+        return
+    for each in (first, config):
+        named = root / CONFIGS_DIR / f"{compute_config_hash(each)}.json"
+        named.parent.mkdir(exist_ok=True)
+        if not named.exists():
+            named.write_text(json.dumps(to_plain(each), indent=2) + "\n", encoding="utf-8")
 
 
 def compute_config_hash(config: Mapping[str, Any]) -> str:

@@ -12,7 +12,8 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Iterator, Mapping, MutableMapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Self, cast
@@ -30,8 +31,16 @@ from xop_lerobot.dataset.facts import (
     EpisodeFacts,
     append_facts,
     compute_config_hash,
+    keep_config,
     read_versions,
-    write_config,
+    to_plain,
+)
+from xop_lerobot.dataset.rollback import (
+    Checkpoint,
+    NotSaved,
+    abandon_writers,
+    check_pictures,
+    find_reason,
 )
 from xop_lerobot.dataset.schedule import keep_schedule
 from xop_lerobot.dataset.shutdown import hold_signals
@@ -56,6 +65,13 @@ class DatasetExists(XopError, FileExistsError):
             f"dataset directory '{root}' exists already. Choose another --dataset.root, delete "
             "it, or add episodes to it with --resume=true"
         )
+
+
+class NotMade(XopError):
+    """The directory of a new dataset cannot be made."""
+
+    def __init__(self, root: Path, reason: str) -> None:
+        super().__init__(f"dataset directory '{root}' cannot be made: {reason}")
 
 
 class WrongFps(XopError, ValueError):
@@ -95,6 +111,7 @@ class XopDataset(LeRobotDataset):
     _session: Session
     _info: RobotInfo
     _columns: Columns | None
+    _config: dict[str, Any]
     _config_hash: str
     _keep_facts: bool
     _own_root: bool
@@ -118,6 +135,7 @@ class XopDataset(LeRobotDataset):
             WrongFps: If the robot runs at another rate.
             BatchedEncoding: If videos should be encoded later than their episodes are saved.
             DatasetExists: If the directory is there already.
+            NotMade: If the system does not let it be made.
         """
         info = get_session(cls.session_name).robot
         _check_encoding(options)
@@ -128,7 +146,13 @@ class XopDataset(LeRobotDataset):
             raise DatasetExists(folder)
         columns = Columns(info) if cls.extra_columns else None
         features = {**features, **(columns.features if columns else {})}
-        dataset = cast("Self", super().create(repo_id, fps, features, root=root, **options))
+        try:
+            dataset = cast("Self", super().create(repo_id, fps, features, root=root, **options))
+        except FileExistsError as error:  # somebody else was faster
+            raise DatasetExists(folder) from error
+        except OSError as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise NotMade(folder, find_reason(error)) from error
         dataset._begin_session(info, columns, options)
         dataset._own_root = True
         return dataset
@@ -176,8 +200,9 @@ class XopDataset(LeRobotDataset):
         self._tick_limit: int | None = None
         self._stop_on_success = self._paused = False
         self._events: MutableMapping[str, bool] = {}
-        self._config_hash = compute_config_hash(self._session.configs)
-        write_config(self.root, self._session.configs)
+        # Written with the first episode: a session that records none changes nothing.
+        self._config = to_plain(self._session.configs)
+        self._config_hash = compute_config_hash(self._config)
         self._attach_writer()
         self._session.begin_episode(self.num_episodes)
 
@@ -275,7 +300,11 @@ class XopDataset(LeRobotDataset):
             self._video.wait()
         self._video.wait_for_images()
         tally.task = str(frame["task"])
-        super().add_frame(frame)
+        try:
+            super().add_frame(frame)
+        except Exception as error:
+            self._explain(error)
+            raise
         if state is not None:
             tally.note_state(state)
         if tick is not None:
@@ -309,7 +338,12 @@ class XopDataset(LeRobotDataset):
     ) -> None:
         """Save the episode so that it survives a crash, and ask the robot to start over.
 
-        One without a frame is none, and is not saved.
+        One without a frame is none, and is not saved. If saving fails, the dataset is closed as
+        it was before.
+
+        Raises:
+            NotSaved: If the episode cannot be written; a full disk is the usual reason.
+            XopError: If frames of its videos were lost in lock-step.
         """
         if episode_data is None and not self.has_pending_frames():
             if self._events:  # else none has begun: LeRobot's rollouts save once more at their end
@@ -322,11 +356,13 @@ class XopDataset(LeRobotDataset):
             )
         length = self._tally.frames
         self._write_mark(episode_data)
-        with hold_signals(), skip_embedding(self), keep_schedule():
+        with hold_signals(), skip_embedding(self), keep_schedule(), self._taken_back_on_failure():
+            check_pictures(self, index)
             super().save_episode(episode_data, parallel_encoding)
-            self._own_root = False
             self._secure()
+            keep_config(self.root, self._config)
             append_facts(self.root, index, length, facts, self.more_facts)
+            self._own_root = False
         if facts.dropped_frames or facts.late:
             logger.warning(
                 "Episode %d dropped %d video frames and ran at %.1f Hz of %d; it is marked so.",
@@ -336,6 +372,37 @@ class XopDataset(LeRobotDataset):
                 self.fps,
             )
         self._begin_next(index + 1)
+
+    @contextmanager
+    def _taken_back_on_failure(self) -> Iterator[None]:
+        """Save in the block; if that fails, close the dataset as it was before.
+
+        Raises:
+            NotSaved: If the system did not write.
+        """
+        info = self.meta.info
+        counts = info.total_episodes, info.total_frames
+        checkpoint = Checkpoint(self.root)
+        try:
+            yield
+        except Exception as error:
+            abandon_writers(self)
+            whole = checkpoint.restore()
+            # `resume` may have made others meanwhile, in `_secure`.
+            self.meta.info.total_episodes, self.meta.info.total_frames = counts
+            self.finalize()
+            self._explain(error, whole=whole)
+            raise
+
+    def _explain(self, error: Exception, *, whole: bool = True) -> None:
+        """Say in one line that the system did not write, if that is what `error` comes from.
+
+        Raises:
+            NotSaved: If it is.
+        """
+        reason = find_reason(error)
+        if reason and not isinstance(error, NotSaved):
+            raise NotSaved(self.root, self.meta.total_episodes, reason, whole=whole) from error
 
     def _write_mark(self, episode_data: dict | None) -> None:
         """Bring `next.success` in line with the operator's mark, as `xop-curate label` does."""
@@ -433,6 +500,7 @@ _KEPT = (
     "_stop_on_success",
     "_paused",
     "_events",
+    "_config",
     "_config_hash",
     "more_facts",
 )

@@ -37,6 +37,7 @@ from xop_lerobot.dataset.curate.subtasks import SUBTASK, read_subtasks, write_su
 from xop_lerobot.dataset.curate.video_files import VideoFiles
 from xop_lerobot.dataset.facts import (
     CONFIG_FILE,
+    CONFIGS_DIR,
     EPISODES_FILE,
     FACTS_DIR,
     FACTS_PREFIX,
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Clip", "NothingLeft", "Step", "Transferred", "transfer"]
 
-CONFIGS_DIR = FACTS_DIR / "configs"
 """Configurations by their hash, where the episodes come from several sessions."""
 _COUNTED = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _SIZES = ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb")
