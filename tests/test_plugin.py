@@ -163,7 +163,7 @@ def test_bad_config(config, case):
 BAD_ROBOTS = {
     "camera": (
         {"cameras": ["head", "hed"]},
-        "unknown camera of toy 'hed'. Known: head",
+        "unknown camera of toy 'hed'. Known: back, head",
     ),
     "policy": (
         {"low_level": LowLevelConfig(name="falcon")},

@@ -41,6 +41,7 @@ MJCF = """
         <geom type="cylinder" size="0.05 0.3" mass="2" contype="0" conaffinity="0"/>
         <site name="head" pos="0 0 0.3"/>
         <camera name="head" pos="0.1 0 0.3" xyaxes="0 -1 0 0.3 0 1"/>
+        <camera name="back" pos="-0.1 0 0.3" xyaxes="0 1 0 -0.3 0 1"/>
         {arms}
       </body>
     </body>

@@ -42,6 +42,7 @@ class RobotInfo:
         realtime: Whether its clock is the wall clock.
         has_truth: Whether its states hold the true position beside the measured one, as only a
             simulation's can.
+        cameras: Height, width and channels of each camera's pictures, by its name.
     """
 
     name: str
@@ -53,6 +54,7 @@ class RobotInfo:
     seed: int
     realtime: bool = False
     has_truth: bool = True
+    cameras: Mapping[str, tuple[int, int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,7 @@ class XopRobot(Robot):
             fps=config.fps,
             seed=config.seed,
             realtime=config.clock == "realtime",
+            cameras=dict.fromkeys(config.cameras, (config.height, config.width, 3)),
         )
         self.cameras = dict.fromkeys(config.cameras)
         # The teleoperator must know the robot before either is connected.
@@ -83,8 +84,7 @@ class XopRobot(Robot):
     @property
     def observation_features(self) -> dict[str, type | tuple[int, int, int]]:
         """Proprioception as floats, then a picture of each camera (height, width, 3)."""
-        size = (self.config.height, self.config.width, 3)
-        return {**dict.fromkeys(self._body.state_keys, float), **dict.fromkeys(self.cameras, size)}
+        return {**dict.fromkeys(self._body.state_keys, float), **self._info.cameras}
 
     @property
     def action_features(self) -> dict[str, type]:

@@ -45,6 +45,7 @@ from lerobot_robot_xop import XopRobotConfig
 from lerobot_teleoperator_xop import XopConfig
 from lerobot_teleoperator_xop.terminal import listen_while_recording
 from xop_lerobot.dataset.host import count_ticks
+from xop_lerobot.dataset.resume import check_storage
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
 from xop_lerobot.dataset.tick import run_tick
 from xop_lerobot.dataset.xop_dataset import XopDataset
@@ -215,7 +216,11 @@ def check_types(config: XopRecordConfig) -> tuple[XopRobotConfig, XopConfig]:
 
 
 def open_dataset(config: XopRecordConfig, robot: "XopRobot", teleop: "Xop") -> XopDataset:
-    """Create the dataset that the flags describe, or open it to add to it."""
+    """Create the dataset that the flags describe, or open it to add to it.
+
+    Raises:
+        XopError: If it cannot be made, or not be added to; see `XopDataset`.
+    """
     flags = config.dataset
     columns = teleop.config.record.columns
     bound = XopDataset.bind(robot.config.session, extra_columns=columns)
@@ -231,7 +236,13 @@ def open_dataset(config: XopRecordConfig, robot: "XopRobot", teleop: "Xop") -> X
         "image_writer_threads": flags.num_image_writer_threads_per_camera * len(robot.cameras),
     }
     if config.resume:
-        return bound.resume(flags.repo_id, **options)
+        dataset = bound.resume(flags.repo_id, **options)
+        try:
+            check_storage(dataset.root, dataset.meta.features, use_videos=flags.video)
+        except XopError:
+            dataset.finalize()
+            raise
+        return dataset
     flags.stamp_repo_id()
     return bound.create(
         flags.repo_id,

@@ -13,7 +13,7 @@ import logging
 import shutil
 import time
 from collections.abc import Iterator, Mapping, MutableMapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Self, cast
@@ -35,6 +35,7 @@ from xop_lerobot.dataset.facts import (
     read_versions,
     to_plain,
 )
+from xop_lerobot.dataset.resume import check_resumable
 from xop_lerobot.dataset.rollback import (
     Checkpoint,
     NotSaved,
@@ -47,7 +48,7 @@ from xop_lerobot.dataset.shutdown import hold_signals
 from xop_lerobot.dataset.tally import Tally
 from xop_lerobot.dataset.video_queue import VideoQueue
 from xop_lerobot.dataset.wishes import grant
-from xop_lerobot.errors import XopError
+from xop_lerobot.errors import BadDataset, BadValue, XopError
 from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
 from xop_lerobot.operator.display import Cue, Progress, Wish
 
@@ -167,27 +168,62 @@ class XopDataset(LeRobotDataset):
 
         Raises:
             LinkError: If the session has no robot, or more than one.
-            WrongFps: If the robot runs at another rate.
             BatchedEncoding: If videos should be encoded later than their episodes are saved.
+            BadDataset: If there is no dataset, or it cannot be read.
+            NotResumable: If it is of another robot, or of other cameras or sizes of pictures.
+            WrongFps: If the robot runs at another rate.
             BadValue: If its columns are those of another version.
         """
         info = get_session(cls.session_name).robot
         _check_encoding(options)
-        dataset = cast("Self", super().resume(repo_id, root=root, **options))
-        if dataset.fps != info.fps:
-            raise WrongFps(info.fps, dataset.fps)
-        columns = Columns(info)
-        has_columns = has_all_columns(dataset.meta.features, columns, dataset.root)
-        if not has_columns and cls.extra_columns:
+        dataset = cls._open(repo_id, root, options)
+        try:
+            columns = dataset._check_fit(info)
+        except BaseException:
+            LeRobotDataset.finalize(dataset)
+            raise
+        if columns is None and cls.extra_columns:
             logger.warning(
                 "'%s' was recorded without the operator's columns; new episodes have none either.",
                 dataset.root,
             )
-        dataset._begin_session(info, columns if has_columns else None, options)
+        dataset._begin_session(info, columns, options)
         episodes = dataset.meta.episodes
         if episodes is not None and len(episodes) > 0:
             dataset._keep_facts = set(FACT_COLUMNS) <= set(episodes.column_names)
         return dataset
+
+    @classmethod
+    def _open(cls, repo_id: str, root: str | Path | None, options: dict[str, Any]) -> Self:
+        """Open a dataset to add to it; see `resume`."""
+        if not root:
+            raise BadValue("--resume=true needs --dataset.root, the directory of the dataset")
+        folder = Path(root)
+        existed = folder.exists()
+        try:
+            return cast("Self", super().resume(repo_id, root=root, **options))
+        except Exception as error:  # of JSON, parquet or the Hub, whatever is wrong with the files
+            first = (str(error).splitlines() or [""])[0]
+            fault = f"it cannot be read ({type(error).__name__}: {first}). "
+            if (folder / "meta" / "info.json").exists():
+                fault += f"`xop-curate repair --root {folder} --out DIR` makes a whole one of it"
+            else:
+                fault = (
+                    f"there is none to add to, nor is '{repo_id}' on the Hub or within reach. "
+                    "Leave --resume out to begin it"
+                )
+            if not existed:
+                with suppress(OSError):
+                    folder.rmdir()  # LeRobot makes it
+            raise BadDataset(folder, fault) from error
+
+    def _check_fit(self, info: RobotInfo) -> Columns | None:
+        """Check that the robot's episodes fit; return our columns, None if there are none."""
+        if self.fps != info.fps:
+            raise WrongFps(info.fps, self.fps)
+        columns, features = Columns(info), self.meta.features
+        check_resumable(self.root, self.meta.robot_type, features, info, columns.features)
+        return columns if has_all_columns(features, columns, self.root) else None
 
     def _begin_session(
         self, info: RobotInfo, columns: Columns | None, options: dict[str, Any]
