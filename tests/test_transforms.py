@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from xop_lerobot.transforms import (
     IDENTITY_POSE,
+    compute_heading,
     compute_heading_squares,
     heading_error,
     make_pose,
@@ -250,3 +251,64 @@ def test_squares_of_heading_errors_equal_those_of_the_vector(seed):
     turn, tilt = compute_heading_squares(goal, quat)
     np.testing.assert_allclose(turn, error[..., 2], atol=1e-9)
     np.testing.assert_allclose(tilt, error[..., :2].sum(-1), atol=1e-9)
+
+
+# -- heading of a head ---------------------------------------------------------------------
+
+looks = st.tuples(  # everything a person does with the head, between the feet included
+    st.floats(-np.pi / 4, np.pi / 4), st.floats(-np.pi / 2, np.radians(150)), angles
+).map(lambda drawn: quat_from_rpy(*drawn))
+
+
+def compute_angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(rotation_error(a, b)))
+
+
+@given(st.floats(-np.pi, np.pi), angles)
+def test_a_nod_of_any_size_leaves_the_heading_alone(pitch, yaw):
+    assert compute_heading(quat_from_rpy(0.0, pitch, yaw)) == pytest.approx(yaw, abs=1e-9)
+
+
+@given(st.floats(-1.5, 1.5), angles)
+def test_a_tilt_to_the_side_leaves_the_heading_of_a_level_gaze_alone(roll, yaw):
+    assert compute_heading(quat_from_rpy(roll, 0.0, yaw)) == pytest.approx(yaw, abs=1e-9)
+
+
+@given(st.floats(-1.0, 1.0), angles)
+def test_straight_down_the_heading_is_where_the_crown_points(roll, yaw):
+    quat = quat_from_rpy(roll, np.pi / 2, yaw)
+    crown = quat_rotate(quat, np.array([0, 0, 1.0]))
+    heading = compute_heading(quat)
+    np.testing.assert_allclose([np.cos(heading), np.sin(heading)], crown[:2], atol=1e-9)
+
+
+@given(angles, quats)
+def test_a_turn_about_the_vertical_adds_to_the_heading(turn, quat):
+    turned = compute_heading(quat_multiply(quat_from_yaw(turn), quat))
+    assert wrap_angle(turned - compute_heading(quat) - turn) == pytest.approx(0, abs=1e-6)
+
+
+@given(quats)
+def test_either_sign_and_any_length_of_a_quaternion_is_the_same_heading(quat):
+    assert compute_heading(-1.5 * quat) == pytest.approx(compute_heading(quat), abs=1e-9)
+
+
+@given(looks, st.tuples(*[st.floats(-1e-3, 1e-3)] * 3).map(np.array))
+def test_the_heading_never_turns_by_twice_as_much_as_the_head(quat, turn):
+    turned = quat_multiply(quat_exp(turn), quat)
+    change = abs(wrap_angle(compute_heading(turned) - compute_heading(quat)))
+    assert change <= 2 * compute_angle(turned, quat) + 1e-9
+
+
+def test_the_heading_of_a_head_that_goes_from_the_zenith_to_the_feet_has_no_step():
+    for roll in np.radians([-45, -20, 0, 20, 45]):
+        nods = np.radians(np.arange(-90, 151))
+        headings = [compute_heading(quat_from_rpy(roll, nod, 0.5)) for nod in nods]
+        assert np.abs(np.diff(np.unwrap(headings))).max() < np.radians(1.0)
+
+
+def test_headings_of_a_batch_are_those_of_each():
+    quats = quat_exp(np.random.default_rng(0).normal(size=(4, 5, 3)))
+    headings = compute_heading(quats)
+    assert headings.shape == (4, 5)
+    assert headings[2, 3] == compute_heading(quats[2, 3])

@@ -96,6 +96,35 @@ def quat_yaw(q: np.ndarray) -> np.ndarray:
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
+def compute_heading(q: np.ndarray) -> np.ndarray:
+    r"""Heading of a head about world Z, defined and smooth wherever a person can look [rad].
+
+    No one axis of a head tells it: the forward axis stands on end in a look straight down and
+    points backwards past it, the left axis stands on end in a head laid on its side. Seen from
+    above, this is the direction of their sum :math:`f + 2\,R_z(-90°)\,l`, which is
+
+    .. math:: \arg\left(3\,(w + iz)^2 + (y - ix)^2\right)
+
+    A nod of any size leaves it alone, and so does a tilt to the side of a head that looks ahead;
+    in a look straight down it is where the crown points. A turn about the vertical adds to it.
+
+    Some orientation has to be without a heading, whatever the formula; here it is a head that
+    looks ahead and lies tilted by 120°, to the left or to the right. From straight up to 150°
+    down and with a tilt of up to 45°, no turn changes the heading by more than 1.8 times its
+    angle.
+
+    For a body that stands upright, and for Tait-Bryan angles, see `quat_yaw`.
+
+    Args:
+        q: Orientation with X forward, Y left, Z up, wxyz. Shape (..., 4).
+
+    Returns:
+        Heading in (−π, π]. Shape (...).
+    """
+    w, x, y, z = _split(q)
+    return np.arctan2(2 * (3 * w * z - x * y), 3 * (w + z) * (w - z) + (y + x) * (y - x))
+
+
 def quat_to_rpy(q: np.ndarray) -> np.ndarray:
     """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll). Shape (..., 4) -> (..., 3)."""
     w, x, y, z = _split(q)

@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.transforms import (
+    compute_heading,
     make_pose,
     quat_conjugate,
     quat_exp,
     quat_log,
     quat_multiply,
-    quat_rotate,
 )
 
-VERTICAL = 0.3
-"""Horizontal part of a forward axis under which it is too steep to tell a heading."""
+__all__ = ["compute_heading", "compute_minimum_jerk", "interpolate_poses"]
 
 
 def interpolate_poses(start: np.ndarray, end: np.ndarray, u: float) -> np.ndarray:
@@ -45,19 +44,3 @@ def compute_minimum_jerk(u: float) -> float:
     """
     u = min(max(u, 0.0), 1.0)
     return u**3 * (10 + u * (6 * u - 15))
-
-
-def compute_heading(quat: np.ndarray) -> float:
-    """Heading of a head about world Z [rad].
-
-    It is that of the forward axis seen from above; when the person looks almost straight up or
-    down, that of the left axis less a quarter turn, which stays level in a nod.
-
-    Args:
-        quat: Orientation with X forward, Y left. Shape (4,), wxyz.
-    """
-    forward = quat_rotate(quat, np.array([1.0, 0, 0]))
-    if np.hypot(forward[0], forward[1]) >= VERTICAL:
-        return float(np.arctan2(forward[1], forward[0]))
-    left = quat_rotate(quat, np.array([0, 1.0, 0]))
-    return float(np.arctan2(-left[0], left[1]))
