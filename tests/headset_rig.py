@@ -108,6 +108,11 @@ class Rig:
     def is_engaged(self) -> bool:
         return self.ticks[-1][1].engaged
 
+    def compute_head(self) -> np.ndarray:
+        """Pose of the robot's head. Shape (7,)."""
+        poses = self.teleop._kinematics.compute_poses(self.loop.state.true_qpos)
+        return poses[self.morphology.frames["head"]]
+
     def compute_largest_steps(self, since: int = 0) -> tuple[float, float]:
         """Largest step of a command against its rate limit, and of an arm joint [rad]."""
         commands = np.array([action.command for action, _ in self.ticks[since:]])

@@ -17,6 +17,8 @@ from headset_rig import POLICIES, RATE, Fault, Rig
 from xop_lerobot.operator.clutch import Clutch, Wish
 from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.state import FRAMES
+from xop_lerobot.transforms import make_pose, pose_multiply, quat_from_yaw
 
 
 @pytest.fixture
@@ -56,6 +58,13 @@ def move(frame: OperatorFrame, x: float) -> OperatorFrame:
         left_wrist=frame.left_wrist + by,
         right_wrist=frame.right_wrist + by,
     )
+
+
+def turn(frame: OperatorFrame, degrees: float) -> OperatorFrame:
+    """What comes from the same person once the headset's space is turned about its origin."""
+    space = make_pose(np.zeros(3), quat_from_yaw(np.radians(degrees)))
+    poses = {name: pose_multiply(space, frame.pose(name)) for name in FRAMES}
+    return dataclasses.replace(frame, **poses)
 
 
 NAN = np.full(7, np.nan)
@@ -100,6 +109,8 @@ def make_stopping() -> dict[str, Fault]:
         "silent stream": lambda t, f: [],
         "lost head": lambda t, f: [dataclasses.replace(f, head=NAN)],
         "moved by 1 m for good": lambda t, f: [move(f, 1.0)],
+        "recentred by 12°": lambda t, f: [turn(f, 12)],
+        "recentred by 40°": lambda t, f: [turn(f, 40)],
         "500 ms of nothing": lambda t, f: [] if t < 0.5 else [f],
     }
 
@@ -125,8 +136,10 @@ def test_faults_that_stop(make_rig, name):
         faults = {what: faults[what] for what in ("frozen stream", "lost head")}
     for what, fault in faults.items():
         rig.engage()
+        head = rig.compute_head()
         rig.run(0.7, fault)
         assert not rig.is_engaged, what
+        np.testing.assert_allclose(rig.compute_head(), head, atol=0.03, err_msg=what)
         assert rig.teleop.notice == (
             "Disengaged: the headset no longer sees where the head is, or is silent. The robot "
             "holds; engage again by the gesture."

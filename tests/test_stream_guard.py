@@ -12,8 +12,16 @@ from hypothesis import strategies as st
 
 from xop_lerobot.errors import BadValue
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_minimum_jerk
 from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
-from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
+from xop_lerobot.state import FRAMES
+from xop_lerobot.transforms import (
+    make_pose,
+    pose_multiply,
+    quat_exp,
+    quat_from_yaw,
+    quat_multiply,
+)
 
 DT = 1 / 100
 
@@ -143,6 +151,83 @@ def test_a_jump_that_lasts_is_where_the_limb_is_now():
     assert all(frame is None for frame in moved[:39])
     assert moved[-1] is not None
     assert guard.relocations == 1
+
+
+def turn_space(frame: OperatorFrame, yaw: float, place=(0.0, 0.0, 0.0)) -> OperatorFrame:
+    """The same person in a space that was turned about a place, or who has turned as a whole."""
+    place = np.array(place)
+    turn = pose_multiply(make_pose(place, quat_from_yaw(yaw)), make_pose(-place, [1, 0, 0, 0]))
+    poses = {name: pose_multiply(turn, frame.pose(name)) for name in FRAMES}
+    return dataclasses.replace(frame, **poses)
+
+
+@pytest.mark.parametrize("lost", [(), (1,), (1, 2)])
+@pytest.mark.parametrize("degrees", [-150, -40, -25, 20, 90])
+@pytest.mark.parametrize("rate", [50, 72, 90])
+def test_a_space_that_is_recentred_is_no_motion(rate, degrees, lost):
+    tracked = np.array([i not in lost for i in range(3)])
+    guard = StreamGuard()
+    for i in range(rate):
+        assert guard.take(person(i / rate, tracked=tracked)) is not None
+    times = 1 + np.arange(rate) / rate
+    taken = [
+        guard.take(turn_space(person(t, tracked=tracked), np.radians(degrees), (0.5, 0.5, 0)))
+        for t in times
+    ]
+    first = next(i for i, frame in enumerate(taken) if frame is not None)
+    assert times[first] - 1 >= 0.39  # longer than a stream is stale
+    assert guard.relocations == 1
+    assert all(frame is not None for frame in taken[first:])
+
+
+@pytest.mark.parametrize("rate, degrees", [(90, 7), (72, 8), (50, 10), (30, 13)])
+def test_hands_that_go_along_tell_a_small_recentring(rate, degrees):
+    guard = StreamGuard()
+    for i in range(rate):
+        assert guard.take(person(i / rate)) is not None
+    for t in 1 + np.arange(0, 0.35, 1 / rate):
+        assert guard.take(turn_space(person(t), np.radians(degrees))) is None
+    # The space is as it was before: nothing was believed in between.
+    assert guard.take(person(1.4)) is not None
+    assert guard.relocations == 0
+
+
+@pytest.mark.parametrize(
+    ("rate", "stream", "seconds"),
+    [
+        *((rate, "good", 1.0) for rate in (30, 50, 72, 90)),
+        *((rate, "a fifth is lost", 1.5) for rate in (30, 50, 72, 90)),
+        *((rate, "in bursts", 1.5) for rate in (50, 72, 90)),
+        *((rate, "120 ms are missing", 1.5) for rate in (50, 72, 90)),
+    ],
+)
+def test_who_turns_round_is_followed(rate, stream, seconds):
+    """By 180° as a whole, hands held before the body: 5.9 or 3.9 rad/s at the peak."""
+    rng = np.random.default_rng(rate)
+    guard = StreamGuard()
+    for t in np.arange(0, 2.2, 1 / rate):
+        frame = turn_space(person(t), np.pi * compute_minimum_jerk((t - 0.3) / seconds))
+        if stream == "a fifth is lost" and rng.random() < 0.2:
+            continue
+        if stream == "120 ms are missing" and 0.9 < t < 1.02:
+            continue
+        if stream == "in bursts":  # every 60 ms some come right behind each other
+            burst, since = divmod(t, 0.06)
+            frame = dataclasses.replace(frame, time=0.06 * burst + 0.001 * since)
+        assert guard.take(frame) is not None, t
+    assert set(guard.counts) == {"taken"}
+
+
+def test_a_jump_does_not_become_a_motion_by_waiting():
+    """What could have been reached meanwhile was still jumped to."""
+    guard = StreamGuard()
+    run(guard, 0, 0.5)
+    taken = run(
+        guard, 0.5, 0.75, lambda f: dataclasses.replace(f, left_wrist=shift(f.left_wrist, 0.2))
+    )
+    tracked = [frame.tracked[1] for frame in taken]
+    assert not any(tracked[:15])
+    assert all(tracked[16:])
 
 
 def test_jumps_to_and_fro_are_never_believed():

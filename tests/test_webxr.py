@@ -128,6 +128,22 @@ def test_standin():
     assert frame.tracked.tolist() == [False, False, True]
 
 
+def test_a_hand_may_name_its_own_source():
+    level = pose((RIGHT, UP, BACK), (-0.2, 1.1, -0.3))
+    grip = pose((UP, BACK, RIGHT), (0.2, 1.1, -0.38))
+    frame = parse(
+        "controllers",
+        left={"source": "standin", "wrist": level, "pinch": 0.03},
+        right={"grip": grip, "trigger": 0},
+    )
+    np.testing.assert_allclose(frame.left_wrist[:3], [0.3, 0.2, 1.1], atol=1e-9)
+    np.testing.assert_allclose(frame.right_wrist[:3], [0.3, -0.2, 1.1], atol=1e-9)
+    np.testing.assert_allclose(frame.pinch, [0.03, 0.08])
+    for unknown in ("feet", None, []):
+        bad = parse(left={"source": unknown, "wrist": level, "pinch": 0.03})
+        assert np.isnan(bad.left_wrist).all()
+
+
 def test_a_guessed_hand_is_not_seen():
     hand = make_joints((RIGHT, UP, BACK), (0, 1, 0))
     assert not parse(left=hand | {"emulated": True}).tracked.any()
@@ -399,6 +415,18 @@ def test_taken_off_and_put_on_again(device, page):
     assert not device.read(0.0).tracked.any()  # somebody else may wear it
     assert device.read(0.0).tracked.all()
     assert device.status.trouble == ""
+
+
+def test_why_the_head_was_lost_is_told_though_frames_go_on(device, page):
+    send(page, device, make_person(0.0), 1)
+    assert device.read(0.0).tracked.all()
+    page.send({"type": "bye", "reason": "the headset was recentred"})
+    send(page, device, make_person(0.02), 2)
+    assert not device.read(0.0).tracked.any()
+    assert device.trouble == "the headset was recentred"
+    send(page, device, make_person(0.04), 3)
+    assert device.read(0.0).tracked.all()
+    assert device.trouble == ""
 
 
 def test_a_page_that_is_loaded_anew(device, page):

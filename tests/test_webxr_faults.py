@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from avp_server import wait_for
 from headset_rig import RATE, Rig, make_person
-from test_headset_faults import move
+from test_headset_faults import move, turn
 from webxr_client import AHEAD_S, CODE, Page, encode, find_port
 
 from xop_lerobot.operator.devices import DeviceConfig
@@ -285,6 +285,23 @@ def test_connections_that_end(make_rig):
         rig.run(0.3)
         assert not rig.is_engaged  # a page that is back moves nothing by itself
         rig.report(end.__name__, before)
+    rig.check()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [4, 25, 120])
+def test_a_headset_that_is_recentred_lets_go_and_turns_no_robot(make_rig, degrees):
+    rig = make_rig("rby1")
+    rig.engage()
+    head = rig.compute_head()
+    rig.page.send({"type": "bye", "reason": "the headset was recentred"})
+    rig.run(0.6, lambda t, f: [turn(f, degrees)])
+    assert not rig.is_engaged
+    assert rig.teleop.notice == (
+        "Disengaged: the headset was recentred. The robot holds; engage again by the gesture."
+    )
+    assert rig.device.trouble == ""  # it is over
+    np.testing.assert_allclose(rig.compute_head(), head, atol=0.02)
     rig.check()
 
 

@@ -12,10 +12,23 @@ import numpy as np
 from xop_lerobot.errors import BadValue
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import rotation_error
+from xop_lerobot.transforms import (
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_conjugate,
+    quat_multiply,
+    rotation_error,
+)
 
+MIN_STEP_TIME = 1 / 90
+"""However close behind each other two frames come, so much lies between what they show [s]."""
 MAX_STEP_TIME = 0.04
 """However long nothing was believed, a limb has moved for no longer than that [s]."""
+MAX_BODY_TIME = 0.1
+"""The same of a whole body, which people turn on purpose and with a network that stalls [s]."""
+ARM = 0.2
+"""A turn counts like the way of a point so far from the wrist [m]."""
 NORM_TOLERANCE = 1e-2
 """How far a quaternion's norm may be from 1."""
 SPACE = 100.0
@@ -40,8 +53,10 @@ class GuardConfig:
         hand_speed: A hand is never faster [m/s].
         head_turn: The head never turns faster [rad/s].
         hand_turn: A hand never turns faster [rad/s].
+        body_turn: Head and hands never turn faster together, as the whole person does [rad/s].
         slack: A jump up to this long is noise [m].
-        turn_slack: A jump up to this angle is noise [rad].
+        head_slack: A jump of the head up to this angle is noise [rad].
+        turn_slack: A jump of a hand up to this angle is noise [rad].
         reach: A hand is never farther from the head [m].
     """
 
@@ -52,7 +67,9 @@ class GuardConfig:
     hand_speed: float = 8.0
     head_turn: float = 15.0
     hand_turn: float = 25.0
+    body_turn: float = 5.0
     slack: float = 0.03
+    head_slack: float = 0.035
     turn_slack: float = 0.3
     reach: float = 1.3
 
@@ -80,18 +97,23 @@ class LimbGuard:
     r"""Judges the poses of one limb in turn.
 
     A pose is a jump if it is farther from the last believed one than
-    :math:`v_{max} \min(dt, 0.04 s) + slack`, or turned by more than the like. Poses that go on
-    smoothly from a jump are believed again after `settle`.
+    :math:`v_{max} dt + slack`, dt from 1/90 to 0.04 s, or turned by more than the like. Poses that
+    go on smoothly from a jump are believed again after `settle`, and not before: that time passes
+    does not make a motion of a jump.
 
     Args:
         speed: Largest speed [m/s].
         turn: Largest rate of turn [rad/s].
         settle: How long a new place must last [s].
-        config: The slacks.
+        slack: A jump up to this long is noise [m].
+        turn_slack: A jump up to this angle is noise [rad].
     """
 
-    def __init__(self, speed: float, turn: float, settle: float, config: GuardConfig) -> None:
-        self._speed, self._turn, self._settle, self._config = speed, turn, settle, config
+    def __init__(
+        self, speed: float, turn: float, settle: float, slack: float, turn_slack: float
+    ) -> None:
+        self._speed, self._turn, self._settle = speed, turn, settle
+        self._slack, self._turn_slack = slack, turn_slack
         self.pose: np.ndarray | None = None
         """The last pose that was believed. Shape (7,)."""
         self._time = 0.0
@@ -102,13 +124,16 @@ class LimbGuard:
         self.relocations = 0
         """How often a jump has turned out to be where the limb is now."""
 
-    def judge(self, time: float, pose: np.ndarray, frozen: float) -> str | None:
+    def judge(
+        self, time: float, pose: np.ndarray, frozen: float, jumped: bool = False
+    ) -> str | None:
         """Take the pose of `time` [s]; return why it is not believed, None if it is.
 
         Args:
             time: Stamp of the frame [s].
             pose: x y z qw qx qy qz. Shape (7,).
             frozen: Time without any change after which the limb is lost [s].
+            jumped: Whether it is known from elsewhere that the limb has jumped.
         """
         reason = _find_nonsense(pose)
         if reason is not None:
@@ -117,7 +142,7 @@ class LimbGuard:
             self._raw, self._changed_at = np.array(pose, dtype=float), time
         elif time - self._changed_at > frozen:
             return "frozen"
-        if self.pose is None or self._follows(self._time, self.pose, time, pose):
+        if self.pose is None or not (jumped or self._has_jumped(time, pose)):
             self._believe(time, pose)
             return None
         candidate = self._candidate
@@ -133,14 +158,45 @@ class LimbGuard:
     def _believe(self, time: float, pose: np.ndarray) -> None:
         self._time, self.pose, self._candidate = time, np.array(pose, dtype=float), None
 
+    def _has_jumped(self, time: float, pose: np.ndarray) -> bool:
+        assert self.pose is not None
+        if not self._follows(self._time, self.pose, time, pose):
+            return True
+        if self._candidate is None:
+            return False
+        # It could have come here by now, but is still where it has jumped to.
+        steps = (compute_step(last, pose) for last in (self._candidate[1], self.pose))
+        (moved, turned), (moved_back, turned_back) = steps
+        return moved + ARM * turned < moved_back + ARM * turned_back
+
     def _follows(self, before: float, last: np.ndarray, time: float, pose: np.ndarray) -> bool:
-        dt = min(time - before, MAX_STEP_TIME)
-        step = float(np.linalg.norm(pose[:3] - last[:3]))
-        turn = float(np.linalg.norm(rotation_error(pose[3:], last[3:])))
+        dt = min(max(time - before, MIN_STEP_TIME), MAX_STEP_TIME)
+        moved, turned = compute_step(last, pose)
         return (
-            step <= self._speed * dt + self._config.slack
-            and turn <= self._turn * dt + self._config.turn_slack
+            moved <= self._speed * dt + self._slack and turned <= self._turn * dt + self._turn_slack
         )
+
+
+def compute_step(last: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
+    """Way [m] and angle [rad] from one pose to another. Shapes (7,)."""
+    turn = rotation_error(pose[3:], last[3:])
+    return float(np.linalg.norm(pose[:3] - last[:3])), float(np.linalg.norm(turn))
+
+
+def goes_along(before: np.ndarray, after: np.ndarray, last: np.ndarray, pose: np.ndarray) -> bool:
+    """Whether a hand has moved with the head, as on one rigid body, rather than stayed.
+
+    Args:
+        before: Pose of the head. Shape (7,).
+        after: The same later. Shape (7,).
+        last: Pose of the hand, with `before`. Shape (7,).
+        pose: Pose of the hand, with `after`. Shape (7,).
+    """
+    turn = quat_multiply(after[3:], quat_conjugate(before[3:]))
+    there, back = make_pose(after[:3], turn), make_pose(before[:3], np.array([1.0, 0, 0, 0]))
+    carried = pose_multiply(there, pose_multiply(pose_inverse(back), last))
+    (moved, turned), (stayed, unturned) = compute_step(carried, pose), compute_step(last, pose)
+    return moved + ARM * turned < (stayed + ARM * unturned) / 2
 
 
 class StreamGuard:
@@ -149,6 +205,9 @@ class StreamGuard:
     A frame whose head cannot be believed is dropped; when that goes on, the stream is stale. A
     hand that cannot be believed is marked as lost, and its pose and pinch stay as they were
     last, so that no bad number gets through. All of it follows the stamps alone.
+
+    When a headset recentres, its whole space turns and shifts, and nobody has moved. That is told
+    from hands that go along with the head: so quickly nobody turns round as a whole.
 
     Args:
         config: What counts as a fault.
@@ -164,11 +223,15 @@ class StreamGuard:
         """Forget what was seen, as after a new connection; the counts stay."""
         c = self.config
         # A head that has jumped must be stale for the readers before it is believed again.
-        head = LimbGuard(c.head_speed, c.head_turn, c.settle + c.stale, c)
+        settle = c.settle + c.stale
         self._limbs = [
-            head,
-            *(LimbGuard(c.hand_speed, c.hand_turn, c.settle, c) for _ in FRAMES[1:]),
+            LimbGuard(c.head_speed, c.head_turn, settle, c.slack, c.head_slack),
+            *(
+                LimbGuard(c.hand_speed, c.hand_turn, c.settle, c.slack, c.turn_slack)
+                for _ in FRAMES[1:]
+            ),
         ]
+        self._taken: OperatorFrame | None = None
         self._pinch = np.full(2, OPEN_PINCH)
         self._time = self._source_time = -math.inf
         self._raw: np.ndarray | None = None
@@ -205,7 +268,8 @@ class StreamGuard:
             self.counts[reason] += 1
             return None
         self.counts["taken"] += 1
-        return self._make(frame)
+        self._taken = self._make(frame)
+        return self._taken
 
     def _find_old(self, frame: OperatorFrame, source_time: float | None) -> str | None:
         if frame.time <= self._time:
@@ -217,8 +281,25 @@ class StreamGuard:
     def _judge_head(self, frame: OperatorFrame) -> str | None:
         if not frame.tracked[0]:
             return "head_lost"
-        reason = self._limbs[0].judge(frame.time, frame.head, self.config.stale)
+        jumped = self._has_space_jumped(frame)
+        reason = self._limbs[0].judge(frame.time, frame.head, self.config.stale, jumped)
         return None if reason is None else f"head_{reason}"
+
+    def _has_space_jumped(self, frame: OperatorFrame) -> bool:
+        """Whether head and hands have turned together by more than a person can."""
+        last = self._taken
+        if last is None or _find_nonsense(frame.head) is not None:
+            return False
+        dt = min(max(frame.time - last.time, MIN_STEP_TIME), MAX_BODY_TIME)
+        turned = compute_step(last.head, frame.head)[1]
+        if turned <= self.config.body_turn * dt + self.config.head_slack:
+            return False
+        hands = [
+            (last.pose(name), frame.pose(name))
+            for name, was, now in zip(FRAMES[1:], last.tracked[1:], frame.tracked[1:], strict=True)
+            if was and now and _find_nonsense(frame.pose(name)) is None
+        ]
+        return bool(hands) and all(goes_along(last.head, frame.head, *pair) for pair in hands)
 
     def _make(self, frame: OperatorFrame) -> OperatorFrame:
         tracked = np.ones(3, dtype=bool)

@@ -100,7 +100,7 @@ class LiveDevice(Device):
         self._heard_at = 0.0
         self._connections = 0
         self._connected = self._left = False
-        self._trouble = ""
+        self._trouble = self._farewell = ""
         self._log = PacedLog(logger)  # what comes and goes is the other side's doing
 
     @property
@@ -218,6 +218,8 @@ class LiveDevice(Device):
             moved = self._relocations != self._read_relocations
             self._read_relocations = self._relocations
             left = self._left
+            if not (moved or left):
+                self._farewell = ""  # whoever was gone is back
             if silent:
                 self._connected = False
         if silent:
@@ -234,9 +236,13 @@ class LiveDevice(Device):
         self.interrupt()
 
     def leave(self, reason: str) -> None:
-        """Take note that nobody wears the headset any more: at once, nothing is tracked."""
+        """Take note that nobody can be followed any more: at once, nothing is tracked.
+
+        Frames that come after it begin anew. The reason is `trouble` until they are read, however
+        soon that is, so that the operator learns why the robot was let go.
+        """
         with self._lock:
-            self._connected, self._left = False, True
+            self._connected, self._left, self._farewell = False, True, reason
         self._say(reason)
 
     @property
@@ -256,5 +262,5 @@ class LiveDevice(Device):
                 rate=sum(t > now - RATE_WINDOW_S for t in self._stamps) / RATE_WINDOW_S,
                 counts=dict(self.guard.counts),
                 connections=self._connections,
-                trouble=self._trouble,
+                trouble=self._trouble or self._farewell,
             )

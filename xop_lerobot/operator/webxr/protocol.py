@@ -54,7 +54,7 @@ class FrameMessage:
     Attributes:
         number: Counts up, one page's frames.
         sent: When it was sent, on the page's clock [s].
-        source: What it was made from, one of `SOURCES`.
+        source: What it was made from, one of `SOURCES`, but for a hand that names its own.
         frame: The same in our convention, at time 0; what is malformed is NaN.
     """
 
@@ -165,6 +165,9 @@ _PARSERS: dict[str, Callable[[Mapping[str, Any]], Message | str]] = {
 def _read_hand(hand: Any, source: str, side: str) -> tuple[np.ndarray, float]:
     """Pose of a wrist, shape (7,), and distance of thumb and index tip [m]; NaN where bad."""
     if not isinstance(hand, dict):
+        return _NOWHERE, math.nan
+    source = hand.get("source", source)
+    if source not in SOURCES:
         return _NOWHERE, math.nan
     if source == "controllers":
         grip = _read_numbers(hand.get("grip"), 7)

@@ -4,6 +4,7 @@ import { Stage } from './stage.js';
 
 const JOINTS = { wrist: 'wrist', thumb: 'thumb-tip', index: 'index-finger-tip' };
 const MODES = ['immersive-ar', 'immersive-vr'];
+const TAKE_OVER_MS = 1000; // so long a hand must be lost until a controller speaks for its side
 
 /** What a session can be begun as here, or why not, in words: `{mode, trouble}`. */
 export async function findMode() {
@@ -69,30 +70,55 @@ function readController(frame, source, space) {
   };
 }
 
+/** How well something is seen: 0 not at all, 1 its place is guessed, 2 it is seen. */
+function rate(seen) {
+  if (!seen) return 0;
+  return seen.emulated ? 1 : 2;
+}
+
 /**
  * Read head and hands.
  *
- * @returns {object} `source`, `head`, `left` and `right` of a frame of the protocol. Hands go
- *   before controllers: who lays the controllers down goes on with the hands.
+ * Headsets list hands and controllers at once, and what is listed need not be seen. On each side the
+ * hand goes before the controller where both are seen: who lays the controllers down goes on with
+ * the hands. A controller that lies about does not take over from a hand that is lost for a moment.
+ *
+ * @param {XRFrame} frame
+ * @param {XRReferenceSpace} space
+ * @param {number} time of the frame [ms]
+ * @param {object} handsAt when the hand of each side was seen last [ms]; it is kept up to date
+ * @returns {object} `source`, `head`, `left` and `right` of a frame of the protocol
  */
-export function readFrame(frame, space) {
+export function readFrame(frame, space, time = 0, handsAt = {}) {
   const viewer = frame.getViewerPose(space);
   const seen = { hands: {}, controllers: {} };
+  const note = (kind, side, found) => {
+    if (rate(found) > rate(seen[kind][side])) seen[kind][side] = found;
+  };
   for (const source of frame.session.inputSources) {
-    if (source.handedness === 'none') continue;
-    if (source.hand) seen.hands[source.handedness] = readHand(frame, source.hand, space);
+    const side = source.handedness;
+    if (side === 'none') continue;
+    if (source.hand) note('hands', side, readHand(frame, source.hand, space));
     else if (source.gripSpace && source.targetRayMode === 'tracked-pointer') {
-      seen.controllers[source.handedness] = readController(frame, source, space);
+      note('controllers', side, readController(frame, source, space));
     }
   }
-  const kind = Object.keys(seen.hands).length || !Object.keys(seen.controllers).length
-    ? 'hands' : 'controllers';
+  const choose = (side) => {
+    const [hand, controller] = [seen.hands[side] ?? null, seen.controllers[side] ?? null];
+    if (rate(hand) === 2) handsAt[side] = time;
+    const waits = time - (handsAt[side] ?? -Infinity) < TAKE_OVER_MS;
+    return waits || rate(hand) >= rate(controller) ? ['hands', hand] : ['controllers', controller];
+  };
+  const [left, right] = [choose('left'), choose('right')];
+  const kinds = [left, right].filter(([, found]) => found).map(([kind]) => kind);
+  const source = kinds.every((kind) => kind === 'hands') ? 'hands' : 'controllers';
+  const write = ([kind, found]) => found && (kind === source ? found : { source: kind, ...found });
   return {
-    source: kind,
+    source,
     // A head whose place is guessed is as good as none.
     head: viewer && !viewer.emulatedPosition ? flatten(viewer) : null,
-    left: seen[kind].left ?? null,
-    right: seen[kind].right ?? null,
+    left: write(left),
+    right: write(right),
   };
 }
 
@@ -115,7 +141,7 @@ function findTroubles(session, data, hasFloor) {
 export class Headset {
   /**
    * @param {object} handlers `frame(data)` with head and hands, `hidden(text)` when the headset is
-   *   off or elsewhere, `shown()`, `ended(text)`
+   *   off or elsewhere, `shown()`, `moved(text)` before frames of another space, `ended(text)`
    * @param {object} hud what is drawn: `canvas`, `update(troubles)`, which tells whether anything
    *   has changed, and `picture`, an image or null
    */
@@ -160,6 +186,10 @@ export class Headset {
       hasFloor = false;
       return session.requestReferenceSpace('local');
     });
+    // Nobody has moved, and yet head and hands are elsewhere from the next frame on.
+    space.addEventListener('reset', () => {
+      this.handlers.moved('the headset was recentred, or has found its place anew');
+    });
     session.addEventListener('visibilitychange', () => {
       if (session.visibilityState === 'hidden') {
         this.handlers.hidden('The headset is off, or shows something else.');
@@ -167,11 +197,12 @@ export class Headset {
         this.handlers.shown();
       }
     });
+    const handsAt = {};
     const tick = (time, frame) => {
       if (this.session !== session) return;
       session.requestAnimationFrame(tick);
       if (session.visibilityState === 'hidden') return;
-      const data = readFrame(frame, space);
+      const data = readFrame(frame, space, time, handsAt);
       this.frames += 1;
       this.handlers.frame(data);
       this.troubles = findTroubles(session, data, hasFloor);

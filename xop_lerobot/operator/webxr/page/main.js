@@ -226,6 +226,7 @@ class App {
       },
       hidden: (reason) => this.link.send({ type: 'bye', reason }),
       shown: () => this.sounds.play('setting'),
+      moved: (reason) => this.link.send({ type: 'bye', reason }),
       ended: (reason) => {
         if (this.headset !== headset) return;
         this.link.send({ type: 'bye', reason });

@@ -7,16 +7,24 @@ const GRID = 0.5; // [m]
 const TRAIL = 200; // places that are remembered
 const HANDS = { left: ['L', '#ffc857'], right: ['R', '#4aa3ff'] };
 
+/** The heading of a head from where its forward and left axes point, as `compute_heading` has it. */
+function findHeading([fx, fy], [lx, ly]) {
+  return Math.atan2(fy - 2 * lx, fx + 2 * ly);
+}
+
 /** A place and heading in the operator's world (x forward, y left) from a pose of the protocol. */
-function fromOperator([x, y, , qw, qx, qy, qz]) {
-  const [fx, fy] = rotate([qx, qy, qz, qw], [1, 0, 0]);
-  return { x, y, heading: Math.atan2(fy, fx) };
+export function fromOperator([x, y, , qw, qx, qy, qz]) {
+  const [forward, left] = [[1, 0, 0], [0, 1, 0]].map((axis) => rotate([qx, qy, qz, qw], axis));
+  return { x, y, heading: findHeading(forward, left) };
 }
 
 /** The same from a pose in the axes of WebXR (x right, y up, z back). */
-function fromWebXr([x, , z, qx, qy, qz, qw]) {
-  const [fx, , fz] = rotate([qx, qy, qz, qw], [0, 0, -1]);
-  return { x: -z, y: -x, heading: Math.atan2(-fx, -fz) };
+export function fromWebXr([x, , z, qx, qy, qz, qw]) {
+  const [forward, left] = [[0, 0, -1], [-1, 0, 0]].map((axis) => {
+    const [ax, , az] = rotate([qx, qy, qz, qw], axis);
+    return [-az, -ax];
+  });
+  return { x: -z, y: -x, heading: findHeading(forward, left) };
 }
 
 /** Draws head and hands around the middle of a canvas; forward is up. */
