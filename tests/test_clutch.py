@@ -181,6 +181,34 @@ def test_a_hand_lost_again_in_the_blend_stays_where_it_is():
     assert np.abs(np.diff(path)).max() < 0.4 * 1.9 / 50
 
 
+@pytest.mark.parametrize(
+    "period, lost", [(0.25, 0.045), (0.5, 0.045), (0.1, 0.016), (1.0, 0.16), (0.4, 0.1), (2.5, 0.4)]
+)
+def test_a_hand_that_comes_and_goes_is_followed(period, lost):
+    """Seen for three quarters of the time or more, it makes all of its way, and no leap."""
+    times = np.arange(0, 6, 1 / 50)
+    hand = 0.5 - 0.2 * np.cos(np.pi * times)  # up to 0.63 m/s
+    path = blend_path(lambda t: t % period >= lost, lambda t: 0.5 - 0.2 * np.cos(np.pi * t))
+    assert np.ptp(path[50:]) > 0.99 * np.ptp(hand)
+    # It was a little behind whenever it was lost, by no more than what it did meanwhile.
+    assert np.sqrt(np.mean(np.square(path - hand)[50:])) < 0.02 + 0.3 * lost
+    assert np.abs(np.diff(path)).max() < 3.5 * 0.63 / 50
+
+
+def test_a_hand_that_comes_and_goes_by_chance_is_followed():
+    seen = np.random.default_rng(0).random(300) > 0.16
+    path = blend_path(lambda t: seen[round(t * 50)], lambda t: float(np.clip(t, 1, 2)))
+    np.testing.assert_allclose(path[150:], 2)
+    assert np.abs(np.diff(path)).max() < 4 / 50
+
+
+def test_a_hand_that_is_found_far_away_soon_is_not_leapt_to():
+    """As one that is mistaken for another: it comes about as slowly as one lost for longer."""
+    path = blend_path(lambda t: not 1 <= t < 1.15, lambda t: 0.3 if t < 1 else 0.9)
+    np.testing.assert_allclose(path[110:], 0.9)
+    assert np.abs(np.diff(path)).max() < 2.0 / 50
+
+
 def test_at_engagement_the_hands_begin_where_the_robot_has_them():
     blend = HandBlend()
     head = make_pose(np.array([1.0, 2, 1.3]), DOWN)

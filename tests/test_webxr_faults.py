@@ -221,6 +221,29 @@ def test_a_lost_hand_freezes_its_arm_alone(make_rig, name):
 
 
 @pytest.mark.slow
+def test_a_hand_that_comes_and_goes_is_followed(make_rig):
+    """At the edge of the view: 45 ms in each quarter of a second it is not seen."""
+    rig = make_rig("rby1")
+    rig.engage()
+    rig.run(0.8)  # until its arms have come to the hands
+    before = len(rig.ticks)
+    unseen = np.array([True, False, True])
+    rig.run(
+        4.0,
+        lambda t, f: [dataclasses.replace(f, tracked=unseen) if t % 0.25 < 0.045 else f],
+    )
+    goals = [record.goal.poses for _, record in rig.ticks[before:]]
+    left, right = (
+        np.array([goal[name][0] - goal["head"][0] for goal in goals])
+        for name in ("left_wrist", "right_wrist")
+    )
+    assert np.ptp(left) > 0.95 * np.ptp(right) > 0.05
+    np.testing.assert_allclose(left, right, atol=0.01)
+    rig.report("left hand lost for 45 ms, four times a second", before)
+    rig.check()
+
+
+@pytest.mark.slow
 def test_a_constant_delay(make_rig):
     """500 ms: nobody engages, and it is told why; who allows it drives, and is warned."""
     delayed = lambda t, f: [dataclasses.replace(f, time=f.time - 0.5)]  # noqa: E731
