@@ -122,9 +122,10 @@ def test_messages_that_are_no_frame():
         update = HandUpdate()
         update.Head.m00 = signal
         assert parse_update(update.SerializeToString()) == "signal"
-    empty = parse_update(HandUpdate().SerializeToString())  # what an outdated client is sent
-    assert isinstance(empty, OperatorFrame)
-    assert np.isnan(np.concatenate([empty.head, empty.left_wrist, empty.pinch])).all()
+    zeros = HandUpdate()
+    zeros.Head.m00 = zeros.left_hand.wristMatrix.m00 = 0.0
+    for empty in (HandUpdate(), zeros):  # what a client of too old a version is sent
+        assert parse_update(empty.SerializeToString()) == "empty"
 
 
 def test_request():
@@ -158,8 +159,23 @@ def test_bad_messages_are_counted_and_the_stream_goes_on(server, device: Any):
     send(server, device, b"\xff\xff\xff")
     send(server, device, HandUpdate().SerializeToString())
     send(server, device, make_person(0.01))
-    assert device.status.counts == {"taken": 2, "no_message": 1, "head_not_finite": 1}
+    assert device.status.counts == {"taken": 2, "no_message": 1, "empty": 1}
     assert device.status.connections == 1
+    assert device.trouble == ""
+
+
+def test_an_app_that_refuses_this_version_is_told_as_such(server, device: Any, caplog):
+    for _ in range(3):
+        send(server, device, HandUpdate().SerializeToString())
+    assert device.read(0.0) is None
+    assert device.trouble == (
+        f"Vision Pro at 127.0.0.1:{server.port}: Tracking Streamer refuses this version of "
+        "xop-lerobot, which speaks 2.50 of its protocol: it sends empty updates"
+    )
+    assert caplog.text.count("Tracking Streamer refuses this version") == 1
+    send(server, device, make_person(0))  # the app is another one now
+    assert device.trouble == ""
+    assert device.read(0.0).tracked.all()
 
 
 def test_a_silent_stream_is_stale_and_then_goes_on(server, device: Any):

@@ -161,18 +161,29 @@ def test_certificate(tmp_path, monkeypatch):
 class Wearer(threading.Thread):
     """Sends a person at `rate` [Hz] who holds the hands still, or shows but one of them."""
 
-    def __init__(self, server: AvpServer, rate: float = 100, one_hand: bool = False) -> None:
+    def __init__(
+        self,
+        server: AvpServer,
+        rate: float = 100,
+        one_hand: bool = False,
+        hand_rate: float | None = None,
+    ) -> None:
         super().__init__(daemon=True)
         self._server, self._rate, self._one_hand = server, rate, one_hand
+        self._hand_period = None if hand_rate is None else 1 / hand_rate
         self.over = threading.Event()
 
     def run(self) -> None:
-        i = 0
+        i, shown, wrists = 0, -1, []
         while not self.over.wait(1 / self._rate):
             i += 1
             sway = 0.001 * np.array([np.sin(i / 9), np.cos(i / 7), np.sin(i / 5)])
             quat = quat_exp(sway)
-            wrists = [make_pose(sway + [0.3, y, 1.1], quat) for y in (0.2, -0.2)]
+            period = self._hand_period
+            now = i if period is None else int(time.monotonic() / period)
+            if now != shown:  # else the app shows them as it did before
+                wrists = [make_pose(sway + [0.3, y, 1.1], quat) for y in (0.2, -0.2)]
+            shown = now
             if self._one_hand:
                 wrists[0] = np.array([0.3, 0.2, 1.1, 1, 0, 0, 0])  # as the app shows a lost one
             head = make_pose(sway + [0, 0, 1.6], quat)
@@ -209,6 +220,34 @@ def test_a_slow_stream_and_a_lost_hand():
     assert lost.level in (Level.WARN, Level.FAIL)
     assert lost.figures["seen"]["left"] < 0.5
     assert lost.figures["counts"]["left_frozen"] > 0
+
+
+def test_hands_that_are_shown_too_seldom():
+    found = measure(hand_rate=8, seconds=1.5)
+    assert found.level is Level.FAIL
+    assert "tells where your hands are only" in found.text
+    assert found.advice.startswith("hold both hands before you, in good light")
+    assert 3 < found.figures["hand_rates_hz"]["left"] < 12.5
+
+
+def test_an_app_that_refuses_this_version():
+    server, over = AvpServer(), threading.Event()
+
+    def refuse() -> None:
+        while not over.wait(0.1):
+            server.send(b"")  # an update in which everything has its default
+
+    refusing = threading.Thread(target=refuse)
+    refusing.start()
+    try:
+        found = check_headset(Setup("avp", "127.0.0.1", server.port, wait=2.0))
+    finally:
+        over.set()
+        refusing.join()
+        server.close()
+    assert found.level is Level.FAIL
+    assert "Tracking Streamer refuses this version of xop-lerobot" in found.text
+    assert found.advice == "update xop-lerobot, or use a version of the app that this one speaks to"
 
 
 def test_nobody_streams():

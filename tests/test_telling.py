@@ -59,20 +59,68 @@ def test_a_late_plan():
     assert late == "The plan is 0.5 s old: this computer is too slow for the planner."
 
 
+class Headset(LiveDevice):
+    address = "nowhere"
+
+    def stream(self) -> None: ...
+    def interrupt(self) -> None: ...
+
+
 def test_a_slow_stream():
-    class Slow(LiveDevice):
-        @property
-        def address(self) -> str:
-            return "nowhere"
-
-        def stream(self) -> None: ...
-        def interrupt(self) -> None: ...
-
-    device = Slow(DeviceConfig(), clock=lambda: now)
+    device = Headset(DeviceConfig(), clock=lambda: now)
     for i in range(12):
         now = 1 + i / 12
         device.receive(make_frame(now, (0.001 * i, 0, 1.6)))
     assert warn(device=device) == ("Only 12 poses arrive in a second: gestures need 25.",)
+
+
+def watch_hands(left_hz: float, right_hz: float, seconds: float = 2.0) -> list[tuple[str, ...]]:
+    """What is told in the last second while the head moves 90 times a second.
+
+    A hand stands between its changes, as a Vision Pro shows it; the left one is gone at 1 s if
+    it has none.
+    """
+    device = Headset(DeviceConfig(), clock=lambda: now)
+    told = []
+    for i in range(round(90 * seconds)):
+        now = 1 + i / 90
+        frame = make_frame(now, (0, 0, 1.6))
+        hands = (frame.left_wrist, left_hz), (frame.right_wrist, right_hz)
+        wrists = [
+            pose + [1e-3 * np.floor(i * hz / 90 if hz else min(i, 90)), 0, 0, 0, 0, 0, 0]
+            for pose, hz in hands
+        ]
+        head = frame.head + [0.001 * np.sin(0.1 * i), 0, 0, 0, 0, 0, 0]
+        device.receive(
+            dataclasses.replace(frame, head=head, left_wrist=wrists[0], right_wrist=wrists[1])
+        )
+        if i >= 90:
+            told.append(warn(device=device, tracked=device.read(0.0).tracked))
+    return told
+
+
+@pytest.mark.parametrize(
+    ("left_hz", "right_hz", "hands", "hz"),
+    [(9, 9, "hands are", 9), (9, 90, "left hand is", 9), (90, 11, "right hand is", 11)],
+)
+def test_hands_that_are_shown_too_seldom(left_hz, right_hz, hands, hz):
+    assert set(watch_hands(left_hz, right_hz)) == {
+        (
+            f"The headset tells where your {hands} only {hz} times a second; they are followed "
+            "from 13 on. Hold them in view, in good light, and end other apps.",
+        )
+    }
+
+
+@pytest.mark.parametrize("hz", [14, 30, 90])
+def test_hands_that_are_shown_often_enough(hz):
+    assert set(watch_hands(hz, hz)) == {()}
+
+
+def test_a_hand_that_goes_out_of_view_is_lost_and_not_slow():
+    told = watch_hands(0, 90)
+    assert set(told) == {(), ("Your left hand is not seen: its arm stands still.",)}
+    assert told[-1] != ()
 
 
 @pytest.mark.parametrize(

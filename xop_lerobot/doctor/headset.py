@@ -33,7 +33,9 @@ def check_headset(setup: Setup) -> Finding:
                 Level.FAIL,
                 f"{device.address}: no pose has come within {setup.wait:g} s"
                 + (f" ({device.trouble})" if device.trouble else ""),
-                "put the headset on, and open its app or the page's address",
+                "update xop-lerobot, or use a version of the app that this one speaks to"
+                if "empty" in device.status.counts
+                else "put the headset on, and open its app or the page's address",
                 {"counts": device.status.counts},
             )
         return _measure(device, setup.seconds)
@@ -62,6 +64,7 @@ def _measure(device, seconds: float) -> Finding:  # noqa: ANN001  a LiveDevice, 
         "delay_ms": delay,
         "longest_gap_ms": round(gap * 1e3, 1),
         "seen": dict(zip(("head", "left", "right"), shares, strict=True)),
+        "hand_rates_hz": dict(zip(("left", "right"), status.hand_rates, strict=True)),
         "counts": {name: n for name, n in counts.items() if n},
     }
     late = "unknown" if delay is None else f"{delay:.0f} ms"
@@ -76,6 +79,14 @@ def _measure(device, seconds: float) -> Finding:  # noqa: ANN001  a LiveDevice, 
             text,
             "the robot would be let go again and again: come nearer to the access point, use "
             "5 GHz or a cable, and end other programs",
+            figures,
+        )
+    if status.slow_hands:
+        return Finding(
+            Level.FAIL,
+            f"{text}. {status.trouble}",
+            "hold both hands before you, in good light, and end other apps of the headset: hands "
+            "of which so few poses come engage nothing",
             figures,
         )
     if rate < GOOD_HZ or (status.delay or 0) > SLOW_S or min(shares) < 0.9:  # noqa: PLR2004

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections import Counter
+import statistics
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +29,10 @@ MAX_STEP_TIME = 0.04
 """However long nothing was believed, a limb has moved for no longer than that [s]."""
 MAX_BODY_TIME = 0.1
 """The same of a whole body, which people turn on purpose and with a network that stalls [s]."""
+RENEWALS = 5
+"""From so many changes of a pose it is told how often it changes."""
+RENEWAL_S = 0.5
+"""A pose that has not changed for so long stands [s]."""
 ARM = 0.2
 """A turn counts like the way of a point so far from the wrist [m]."""
 NORM_TOLERANCE = 1e-2
@@ -119,6 +125,7 @@ class LimbGuard:
         self._time = 0.0
         self._raw = np.full(7, np.nan)
         self._changed_at = 0.0
+        self._changes: deque[float] = deque(maxlen=RENEWALS)
         self._candidate: tuple[float, np.ndarray] | None = None
         self._candidate_since = 0.0
         self.relocations = 0
@@ -140,6 +147,7 @@ class LimbGuard:
             return reason
         if not np.array_equal(pose, self._raw):
             self._raw, self._changed_at = np.array(pose, dtype=float), time
+            self._changes.append(time)
         elif time - self._changed_at > frozen:
             return "frozen"
         if self.pose is None or not (jumped or self._has_jumped(time, pose)):
@@ -154,6 +162,13 @@ class LimbGuard:
         self.relocations += 1
         self._believe(time, pose)
         return None
+
+    def compute_rate(self, time: float) -> float | None:
+        """How often the pose has changed lately [Hz]; None where it stands, or is new."""
+        changes = self._changes
+        if len(changes) < RENEWALS or time - changes[-1] > RENEWAL_S:
+            return None
+        return 1 / statistics.median(b - a for a, b in itertools.pairwise(changes))
 
     def _believe(self, time: float, pose: np.ndarray) -> None:
         self._time, self.pose, self._candidate = time, np.array(pose, dtype=float), None
@@ -240,6 +255,11 @@ class StreamGuard:
     def relocations(self) -> int:
         """How often the head has turned out to be elsewhere; it is aligned anew then."""
         return self._limbs[0].relocations
+
+    def compute_hand_rates(self, time: float) -> tuple[float | None, float | None]:
+        """How often the poses of left and right hand change [Hz]; None where that is not known."""
+        left, right = (limb.compute_rate(time) for limb in self._limbs[1:])
+        return left, right
 
     def take(self, frame: OperatorFrame, source_time: float | None = None) -> OperatorFrame | None:
         """Judge a frame.

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from xop_lerobot.operator.device import Device
-from xop_lerobot.operator.devices.live import LiveDevice
+from xop_lerobot.operator.devices.live import HANDS, LiveDevice
 from xop_lerobot.operator.display import Cue, NoticeBoard
 from xop_lerobot.operator.frame import OperatorFrame
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from xop_lerobot.retarget.changes import Change
     from xop_lerobot.retarget.online import AppliedChange
 
-HANDS = ("left", "right")
 SLOW_HZ = 25.0
 """Rate of a stream under which gestures are missed [Hz]."""
 LATE_S = 0.3
@@ -71,16 +70,19 @@ def list_warnings(
     warnings = [f"{trouble[:1].upper()}{trouble[1:]}."] if trouble else []
     if device.trouble:
         warnings.append(device.trouble)
+    status = device.status if isinstance(device, LiveDevice) else None
     if frame is not None and not frame.tracked[0]:
         if not device.trouble:
             warnings.append("The headset does not see where it is, or sends nothing.")
     elif frame is not None:
-        lost = [side for side, seen in zip(HANDS, frame.tracked[1:], strict=True) if not seen]
+        slow = () if status is None else status.slow_hands  # the device tells of these
+        tracked = zip(HANDS, frame.tracked[1:], strict=True)
+        lost = [side for side, seen in tracked if not seen and side not in slow]
         if lost:
             hands = f"{lost[0]} hand is" if len(lost) == 1 else "hands are"
             stands = f": {'its arm stands' if len(lost) == 1 else 'the arms stand'} still"
             warnings.append(f"Your {hands} not seen{stands if engaged else ''}.")
-        rate = device.status.rate if isinstance(device, LiveDevice) else math.inf
+        rate = math.inf if status is None else status.rate
         if rate < SLOW_HZ:
             warnings.append(
                 f"Only {rate:.0f} poses arrive in a second: gestures need {SLOW_HZ:.0f}."

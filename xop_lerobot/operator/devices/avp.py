@@ -10,9 +10,16 @@ import grpc
 
 from xop_lerobot.errors import BadValue
 from xop_lerobot.operator.devices.address import find_own_address
-from xop_lerobot.operator.devices.avp_protocol import METHOD, PORT, make_request, parse_update
+from xop_lerobot.operator.devices.avp_protocol import (
+    METHOD,
+    PORT,
+    VERSION,
+    make_request,
+    parse_update,
+)
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.live import LiveDevice, StreamLost
+from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.pairing import MAX_RATE, RateLimit
 
 MAX_MESSAGE = 256 * 1024
@@ -72,16 +79,26 @@ class AvpDevice(LiveDevice):
                     if rate.is_broken(time.monotonic()):
                         raise StreamLost(f"it sends more than {MAX_RATE} messages in a second")
                     self.hear()
-                    frame = parse_update(message)
-                    if isinstance(frame, str):
-                        self.refuse(frame)
-                    else:
-                        self.receive(frame)
+                    self._take(parse_update(message))
             except grpc.RpcError as error:
                 raise StreamLost(_describe(error)) from None
             finally:
                 with self._call_lock:
                     self._call = None
+
+    def _take(self, frame: OperatorFrame | str) -> None:
+        refused = (
+            f"{self.address}: Tracking Streamer refuses this version of xop-lerobot, which speaks "
+            f"{VERSION} of its protocol: it sends empty updates"
+        )
+        if isinstance(frame, OperatorFrame):
+            if self._trouble == refused:
+                self._say("")
+            self.receive(frame)
+            return
+        if frame == "empty":
+            self._say(refused)
+        self.refuse(frame)
 
     def interrupt(self) -> None:
         """End the call, if there is one."""

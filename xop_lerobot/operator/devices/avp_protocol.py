@@ -22,8 +22,10 @@ METHOD = f"/{SERVICE}/StreamHandUpdates"
 PORT = 12345
 DISCOVERY = 888.0
 """`Head.m00` of a request that names its sender; the app sends zeros to others."""
+VERSION = "2.50"
+"""The version of the protocol that we speak."""
 VERSION_CODE = 25000
-"""`Head.m30` of a request: the version of the protocol that we speak, 2.50."""
+"""`Head.m30` of a request: the same as a number."""
 SIGNALS = frozenset({666.0, 777.0, 778.0, 888.0, 999.0})
 """`Head.m00` of messages that hold something else than a head."""
 THUMB_TIP, INDEX_TIP = 4, 9
@@ -95,7 +97,8 @@ def parse_update(message: bytes) -> OperatorFrame | str:
     """Decode a message of the stream.
 
     Returns:
-        The frame at time 0, in which what is not valid is NaN; or why there is none.
+        The frame at time 0, in which what is not valid is NaN; or why there is none: `empty` is
+        what the app sends to a client whose version it refuses.
     """
     update = HandUpdate()
     try:
@@ -105,6 +108,9 @@ def parse_update(message: bytes) -> OperatorFrame | str:
     head = update.Head
     if head.m00 in SIGNALS:
         return "signal"
+    anchors = (head, update.left_hand.wristMatrix, update.right_hand.wristMatrix)
+    if not any(read_matrix(anchor).any() for anchor in anchors):
+        return "empty"
     wrists, pinch = [], []
     for side in ("left", "right"):
         hand = getattr(update, f"{side}_hand")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import threading
 import time as clocks
 from abc import abstractmethod
@@ -24,12 +25,15 @@ from xop_lerobot.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
 
+HANDS = ("left", "right")
 RETRY_S = 1.0
 """Time between two attempts to connect [s]."""
 SILENT_S = 2.0
 """A connection over which nothing came for so long is made anew [s]."""
 RATE_WINDOW_S = 1.0
 """Time over which the rate of the stream is counted [s]."""
+HAND_HZ = 1 / GuardConfig.frozen
+"""Rate of a hand's poses under which it counts as lost between one and the next [Hz]."""
 
 
 class StreamLost(XopError):
@@ -50,6 +54,8 @@ class StreamStatus:
         trouble: What is wrong, in words; empty if nothing is.
         delay: How old a frame is when it arrives, half of the frames of the last second are
             older [s]; None where the device cannot tell.
+        hand_rates: How often the poses of left and right hand change, which may be less often
+            than frames come [Hz]; None where a hand stands or is not seen.
     """
 
     connected: bool
@@ -59,6 +65,14 @@ class StreamStatus:
     connections: int
     trouble: str
     delay: float | None = None
+    hand_rates: tuple[float | None, float | None] = (None, None)
+
+    @property
+    def slow_hands(self) -> tuple[str, ...]:
+        """The hands that change so much less often than frames come that they count as lost."""
+        slow = min(HAND_HZ, 0.8 * self.rate)
+        rates = zip(HANDS, self.hand_rates, strict=True)
+        return tuple(side for side, rate in rates if rate is not None and rate < slow)
 
 
 class LiveDevice(Device):
@@ -256,11 +270,26 @@ class LiveDevice(Device):
         with self._lock:
             now = self.clock()
             age = float("inf") if self._newest is None else now - self._newest.time
-            return StreamStatus(
+            status = StreamStatus(
                 connected=self._connected,
                 age=age,
                 rate=sum(t > now - RATE_WINDOW_S for t in self._stamps) / RATE_WINDOW_S,
                 counts=dict(self.guard.counts),
                 connections=self._connections,
                 trouble=self._trouble or self._farewell,
+                hand_rates=self.guard.compute_hand_rates(now),
             )
+        if status.trouble or not status.slow_hands or age > self.guard.config.stale:
+            return status
+        return dataclasses.replace(status, trouble=_describe_slow_hands(status))
+
+
+def _describe_slow_hands(status: StreamStatus) -> str:
+    slow = status.slow_hands
+    rate = min(rate for rate in status.hand_rates if rate is not None)
+    hands = f"{slow[0]} hand" if len(slow) == 1 else "hands"
+    return (
+        f"The headset tells where your {hands} {'is' if len(slow) == 1 else 'are'} only "
+        f"{rate:.0f} times a second; they are followed from {math.ceil(HAND_HZ)} on. Hold them in "
+        "view, in good light, and end other apps."
+    )
