@@ -60,7 +60,9 @@ def test_a_late_plan():
 
 
 class Headset(LiveDevice):
-    address = "nowhere"
+    @property
+    def address(self) -> str:
+        return "nowhere"
 
     def stream(self) -> None: ...
     def interrupt(self) -> None: ...
@@ -95,7 +97,9 @@ def watch_hands(left_hz: float, right_hz: float, seconds: float = 2.0) -> list[t
             dataclasses.replace(frame, head=head, left_wrist=wrists[0], right_wrist=wrists[1])
         )
         if i >= 90:
-            told.append(warn(device=device, tracked=device.read(0.0).tracked))
+            shown = device.read(0.0)
+            assert shown is not None
+            told.append(warn(device=device, tracked=shown.tracked))
     return told
 
 

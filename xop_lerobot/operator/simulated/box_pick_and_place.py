@@ -145,7 +145,7 @@ def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
 def keep_distance(mind: Mind) -> Doing:
     """Lean back, or ahead, to have the box at the distance at which arms work well."""
     head, box = mind.eyes.pose("head"), mind.eyes.pose("box")
-    ahead = compute_ahead(compute_heading(head[3:]))
+    ahead = compute_ahead(float(compute_heading(head[3:])))
     error = float((box - head)[:3] @ ahead) - compute_reach(mind) - FARTHER
     mind.note(f"box {100 * error:.0f} cm too far")
     if abs(error) > 0.5 * STAND_NEAR:
@@ -158,7 +158,7 @@ def walk_to_table(mind: Mind) -> Doing:
     hands = mind.body.posture.hands
     yield from set_mode(mind, Mode.MOBILE)
     head = mind.eyes.pose("head")
-    heading = compute_heading(head[3:])
+    heading = float(compute_heading(head[3:]))
     back = np.array([*(head[:3] - BACK * compute_ahead(heading))[:2], heading])
     yield from go_to(mind, back, hands=hands, laden=True, tolerance=0.15, tries=2)
     yield from find(mind, "spot")
@@ -258,7 +258,8 @@ def level(mind: Mind) -> Doing:
         yield from mind.settle("left_palm", "right_palm")
         pose = mind.eyes.pose("box")
         up = quat_rotate(pose[3:], np.array([0, 0, 1.0]))
-        tilt = float(np.arcsin(up @ compute_ahead(compute_heading(mind.eyes.pose("head")[3:]))))
+        ahead = compute_ahead(float(compute_heading(mind.eyes.pose("head")[3:])))
+        tilt = float(np.arcsin(up @ ahead))
         mind.note(f"box tilted by {np.degrees(tilt):.0f}°")
         if abs(tilt) < LEVEL:
             return

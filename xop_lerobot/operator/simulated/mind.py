@@ -89,7 +89,7 @@ class Mind:
         """Perceive what has arrived by `time` [s] of the robot's clock."""
         heading = None
         if self._belief is not None:
-            heading = self._belief.turn + compute_heading(self.body.compute_head()[3:])
+            heading = self._belief.turn + float(compute_heading(self.body.compute_head()[3:]))
         self.eyes.advance(time, float(self.body.posture.look[1]), heading)
 
     def note(self, text: str) -> None:
