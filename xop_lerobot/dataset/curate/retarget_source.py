@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from xop_lerobot.dataset.curate.clip import PROVENANCE, Clip, Step, make_facts
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
+from xop_lerobot.dataset.curate.task_words import TASK, read_tasks
 from xop_lerobot.errors import BadDataset, BadRecording, BadValue
 from xop_lerobot.operator.dataset_recording import choose_columns, make_dataset_recording
 from xop_lerobot.operator.recording import Recording
-
-TASKS_FILE = Path("meta") / "tasks.parquet"
-_TASK = "task_index"
 
 
 @dataclass(frozen=True)
@@ -82,24 +79,16 @@ class Operators:
         self, entry: EpisodeEntry, rows: np.ndarray, stamps: np.ndarray
     ) -> tuple[tuple[float, str], ...]:
         """Find the tasks in words, and from when on they are those [s]."""
-        if len(entry.tasks) == 1 or _TASK not in self._source.features:
+        if len(entry.tasks) == 1 or TASK not in self._source.features:
             return ((0.0, " | ".join(entry.tasks)),)
-        numbers = self._source.read(entry, [_TASK])[_TASK][rows, 0]
+        numbers = self._source.read(entry, [TASK])[TASK][rows, 0]
         begins = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 1))
         names = self._read_names()
         return tuple((float(stamps[i]), names.get(int(numbers[i]), "")) for i in begins)
 
     def _read_names(self) -> dict[int, str]:
         if self._names is None:
-            from lerobot.datasets.io_utils import load_tasks  # noqa: PLC0415 torch
-
-            try:
-                table: Any = load_tasks(self._source.root)
-                self._names = dict(zip(table[_TASK].tolist(), map(str, table.index), strict=True))
-            except (OSError, ValueError, KeyError) as error:
-                raise BadDataset(
-                    self._source.root, f"{TASKS_FILE} is not readable ({error})"
-                ) from error
+            self._names = read_tasks(self._source.root)
         return self._names
 
 

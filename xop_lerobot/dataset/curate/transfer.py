@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.datasets.io_utils import load_tasks
 from lerobot.datasets.utils import DEFAULT_CHUNK_SIZE, DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
 
 from xop_lerobot.dataset.curate.clip import PROVENANCE, Clip, Step, make_facts
@@ -34,6 +33,7 @@ from xop_lerobot.dataset.curate.episode_stats import (
 from xop_lerobot.dataset.curate.pictures import Cut, decode
 from xop_lerobot.dataset.curate.row_files import RowFiles
 from xop_lerobot.dataset.curate.subtasks import SUBTASK, read_subtasks, write_subtasks
+from xop_lerobot.dataset.curate.task_words import TASK, TASKS_FILE, read_tasks
 from xop_lerobot.dataset.curate.video_files import VideoFiles
 from xop_lerobot.dataset.facts import (
     CONFIG_FILE,
@@ -266,11 +266,7 @@ class _SourceParts:
 
     def __init__(self, root: Path) -> None:
         self.stats = StatsReader(root)
-        try:
-            tasks = load_tasks(root)
-            self._names = dict(zip(tasks["task_index"].tolist(), tasks.index, strict=True))
-        except Exception as error:  # whatever pandas makes of a malformed file
-            raise BadDataset(root, f"meta/tasks.parquet is not readable ({error})") from error
+        self._names = read_tasks(root)
         self._root = root
         self.subtasks = read_subtasks(root)
 
@@ -278,15 +274,15 @@ class _SourceParts:
         """Name the task of each row."""
         if clip.task is not None:
             return [clip.task] * table.num_rows
-        numbers = table["task_index"].to_pylist()
+        numbers = table[TASK].to_pylist()
         unknown = sorted(set(numbers) - set(self._names), key=str)
         if unknown:
             raise BadDataset(
                 self._root,
                 f"episode {clip.entry.index} has the task_index {unknown[0]}, which "
-                f"meta/tasks.parquet does not list. It lists {', '.join(map(str, self._names))}",
+                f"{TASKS_FILE} does not list. It lists {', '.join(map(str, self._names))}",
             )
-        return [str(self._names[number]) for number in numbers]
+        return [self._names[number] for number in numbers]
 
 
 def _cut_videos(clip: Clip, keys: Iterable[str]) -> dict[str, Cut]:

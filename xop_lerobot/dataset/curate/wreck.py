@@ -32,12 +32,12 @@ from xop_lerobot.dataset.curate.pictures import VideoIndex, index_video
 from xop_lerobot.dataset.curate.row_files import make_rows, make_schema
 from xop_lerobot.dataset.curate.salvage import CannotSalvage, salvage
 from xop_lerobot.dataset.curate.source import Source
+from xop_lerobot.dataset.curate.task_words import TASKS_FILE, has_index_of_words, read_tasks
 from xop_lerobot.dataset.facts import FACTS_DIR
 from xop_lerobot.errors import BadDataset
 from xop_lerobot.wording import say_count
 
 _COUNTERS = ("episode_index", "frame_index", "task_index")
-_TASKS = Path("meta") / "tasks.parquet"
 # What reading a parquet file raises that is not what it should be; names may be no text.
 _UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError)
 
@@ -71,7 +71,7 @@ def lay_out(root: Path, folder: Path) -> Wreck:
         info, features = source.info, source.features
     wreck = Wreck(root, source)
     (folder / "meta").mkdir(parents=True)
-    for name in (Path("meta") / "info.json", _TASKS):
+    for name in (Path("meta") / "info.json", TASKS_FILE):
         if (root / name).is_file():
             shutil.copyfile(root / name, folder / name)
     if (root / FACTS_DIR).is_dir():
@@ -159,11 +159,12 @@ def _find_tasks(
 ) -> dict[int, str]:
     """Read the tasks by their numbers, or find them by the episodes that have a single one."""
     try:
-        table = pq.read_table(folder / _TASKS).to_pydict()
-        names = next(values for key, values in table.items() if key != "task_index")
-        return dict(zip(table["task_index"], map(str, names), strict=True))
-    except (*_UNREADABLE, KeyError, StopIteration):
-        wreck.notes.append(f"{_TASKS} is not readable: made anew of what the episodes say")
+        tasks = read_tasks(folder)
+        if not has_index_of_words(folder):
+            wreck.notes.append(f"{TASKS_FILE} has its words where LeRobot does not look: mended")
+        return tasks
+    except BadDataset:
+        wreck.notes.append(f"{TASKS_FILE} is not readable: made anew of what the episodes say")
     tasks: dict[int, str] = {}
     for index, (_, table) in rows.items():
         numbers = table["task_index"].unique().to_pylist()
@@ -172,7 +173,7 @@ def _find_tasks(
     numbers = sorted({n for _, table in rows.values() for n in table["task_index"].to_pylist()})
     for number in numbers:
         tasks.setdefault(number, f"task {number}")
-    (folder / _TASKS).unlink(missing_ok=True)
+    (folder / TASKS_FILE).unlink(missing_ok=True)
     write_tasks(
         pd.DataFrame({"task_index": list(tasks)}, index=pd.Index(tasks.values(), name="task")),
         folder,
