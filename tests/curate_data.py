@@ -15,6 +15,7 @@ os.environ.setdefault("HF_LEROBOT_HOME", tempfile.mkdtemp(prefix="lerobot-"))
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 
 from xop_lerobot.dataset.curate.synthetic import make_dataset
@@ -79,3 +80,41 @@ def rewrite(path: Path, columns: Mapping[str, Any], drop: tuple[str, ...] = ()) 
         else:
             table = table.append_column(name, array)
     pq.write_table(table.replace_schema_metadata(None), path)
+
+
+CAMERA = "observation.images.cam"
+
+
+def make_numbered(root: Path, lengths: tuple[int, ...], *, one_file: bool = False) -> Path:
+    """A dataset whose pictures say their number, by their grey; up to 60 of them."""
+    features = {
+        "action": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},
+        CAMERA: {
+            "dtype": "video", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"],
+        },
+    }  # fmt: skip
+    dataset = LeRobotDataset.create(
+        "somebody/numbered", 10, features, root=root, robot_type="so101",
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="ultrafast"),
+    )  # fmt: skip
+    if not one_file:
+        tiny: Any = 1e-6  # each episode has files of its own then
+        dataset.meta.update_chunk_settings(None, tiny, tiny)
+    number = 0
+    for episode, length in enumerate(lengths):
+        for _ in range(length):
+            picture = np.full((SIZE, SIZE, 3), 4 * number, np.uint8)
+            action = np.array([number, 0], np.float32)
+            dataset.add_frame({"action": action, CAMERA: picture, "task": f"task {episode % 2}"})
+            number += 1
+        with keep_schedule():
+            dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def read_numbers(root: Path) -> list[tuple[int, int]]:
+    """The number of each row, and that of its picture as LeRobot shows it, of `make_numbered`."""
+    dataset = LeRobotDataset("local/numbered", root=root)
+    rows: list[Any] = [dataset[index] for index in range(len(dataset))]
+    return [(int(row["action"][0]), round(float(row[CAMERA].mean()) * 255 / 4)) for row in rows]

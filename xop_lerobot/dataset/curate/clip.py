@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.errors import BadShape, BadValue
+from xop_lerobot.errors import BadDataset, BadShape, BadValue
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,9 +44,12 @@ class Clip:
         """Check that there are such rows.
 
         Raises:
-            BadValue: If there are not.
+            BadDataset: If the episode has no rows at all.
+            BadValue: If it has not these.
             BadShape: If a column has not a row for each of them.
         """
+        if not self.entry.has_rows:
+            raise make_refusal(self)
         start, stop = self.span
         if not 0 <= start < stop <= self.entry.length:
             raise BadValue(
@@ -70,6 +73,13 @@ class Clip:
     def is_cut(self) -> bool:
         """Whether rows are left out."""
         return self.span != (0, self.entry.length)
+
+
+def make_refusal(clip: Clip) -> BadDataset:
+    """Make the error of an episode that cannot be handed on, as its `faults` say."""
+    return BadDataset(
+        clip.source.root, f"{clip.entry.faults[0]}. `xop-curate repair` keeps what is whole"
+    )
 
 
 @dataclass(frozen=True)

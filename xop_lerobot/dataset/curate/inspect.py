@@ -65,6 +65,7 @@ def add_arguments(parser: CommandParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Inspect a dataset; returns the exit code."""
+    from xop_lerobot.dataset.curate.order_check import check_whole  # noqa: PLC0415
     from xop_lerobot.dataset.curate.survey import survey  # noqa: PLC0415 SciPy, MuJoCo
     from xop_lerobot.dataset.curate.tables import Table, Totals  # noqa: PLC0415
 
@@ -88,6 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
         if not faults and totals.episodes != total:
             counted = say_count(total, "episode")
             faults.append(f"meta/info.json counts {counted}, there are {totals.episodes}")
+        if not faults:
+            faults += check_whole(source, totals.frames)
     for fault in faults:
         print(f"problem: {fault}", file=sys.stderr)
     if not to_output:

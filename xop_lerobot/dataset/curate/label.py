@@ -166,11 +166,12 @@ class Labeller:
     ) -> None:
         self._source, self._success, self._rules = source, success, rules
         self._labels = labels or {}
-        strange = self._labels.keys() - range(source.total_episodes)
+        there = {entry.index for entry in source.episodes} if self._labels else set[int]()
+        strange = self._labels.keys() - there
         if strange:
             raise BadValue(
                 f"there are labels of episode {min(strange)}, but '{source.root}' has "
-                f"{say_count(source.total_episodes, 'episode')}"
+                f"{say_count(len(there), 'episode')}"
             )
         self.names = list(rules.names) if rules else []
         marked = [name for each in self._labels.values() for name, _ in each.subtasks]

@@ -61,6 +61,7 @@ def add_arguments(parser: CommandParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the report of a dataset; returns the exit code."""
+    from xop_lerobot.dataset.curate.order_check import check_whole  # noqa: PLC0415
     from xop_lerobot.dataset.curate.report_episode import Limits  # noqa: PLC0415 SciPy, MuJoCo
     from xop_lerobot.dataset.curate.report_page import Report  # noqa: PLC0415
     from xop_lerobot.dataset.curate.survey import survey  # noqa: PLC0415
@@ -94,6 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
                     f"meta/info.json counts {say_count(total, 'episode')}, "
                     f"there are {report.episodes}"
                 )
+            if wanted is None and not faults:
+                faults += check_whole(source, report.frames)
             report.finish(faults, missing)
     for fault in faults:
         print(f"problem: {fault}", file=sys.stderr)

@@ -98,6 +98,11 @@ class Report:
             if not any(folder.iterdir()):
                 folder.rmdir()
 
+    @property
+    def frames(self) -> int:
+        """How many frames the episodes have that came so far."""
+        return self._totals.frames
+
     def add(self, finding: Finding) -> None:
         """Add an episode."""
         # Evenly: of `count` episodes, those at which the share of `detailed` reaches a new one.

@@ -66,7 +66,7 @@ class Operators:
         try:
             columns = source.read(entry, self._columns)
             recording, rows = make_dataset_recording(
-                columns, source.features, f"{source.root} (episode {entry.index})"
+                columns, source.features, f"{source.root} (episode {entry.index})", source.fps
             )
             tasks = self._find_tasks(entry, rows, recording.t)
         except (BadRecording, BadDataset) as error:

@@ -62,6 +62,8 @@ class RowReader:
         Raises:
             BadDataset: If the file is not readable, or one is not.
         """
+        if not entry.has_rows:
+            raise BadDataset(self._root, entry.faults[0])
         try:
             self._open(entry.file)
         except UNREADABLE as error:
@@ -76,6 +78,8 @@ class RowReader:
             BadDataset: If the file is not readable, has not these columns, or does not hold the
                 whole episode.
         """
+        if not entry.has_rows:
+            raise BadDataset(self._root, entry.faults[0])
         if not names:
             self.check(entry)
             names = [key for key, each in self._features.items() if each["dtype"] != "video"]

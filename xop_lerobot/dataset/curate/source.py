@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -12,7 +13,13 @@ from typing import Any, Self
 import numpy as np
 import pyarrow as pa
 
-from xop_lerobot.dataset.curate.entries import EpisodeEntry, VideoSpan, read_entries
+from xop_lerobot.dataset.curate.entries import (
+    EpisodeEntry,
+    VideoSpan,
+    VideoUse,
+    find_video_use,
+    read_entries,
+)
 from xop_lerobot.dataset.curate.rows import RowReader
 from xop_lerobot.dataset.facts import CONFIG_FILE
 from xop_lerobot.errors import BadDataset
@@ -88,7 +95,16 @@ class Source:
         Raises:
             BadDataset: If the metadata is missing or malformed.
         """
-        return read_entries(self.root, self.info, note)
+        return read_entries(self.root, self.info, note, self.video_use)
+
+    @cached_property
+    def video_use(self) -> VideoUse:
+        """Which videos belong to episodes, and which pictures to more than one.
+
+        Raises:
+            BadDataset: If the pattern of the paths is malformed.
+        """
+        return find_video_use(self.root, self.info)
 
     def read(self, entry: EpisodeEntry, columns: Iterable[str]) -> dict[str, np.ndarray]:
         """Read columns of an episode, and nothing else.

@@ -51,10 +51,12 @@ def read_stills(
     Raises:
         BadDataset: If they cannot be read.
     """
-    if not entry.length or not number:
+    is_video = source.features[camera]["dtype"] == "video"
+    # Where a video is not to be found, the faults of the episode say so.
+    if not entry.has_rows or not number or (is_video and camera not in entry.videos):
         return []
     moments = choose_moments(entry.length, number).tolist()
-    read = _read_video if camera in entry.videos else _read_images
+    read = _read_video if is_video else _read_images
     stills = [Still(frame, _shrink(each, width)) for frame, each in
               zip(moments, read(source, entry, camera, moments), strict=True)]  # fmt: skip
     return stills

@@ -12,6 +12,7 @@ import numpy as np
 from xop_lerobot.dataset.curate.expression import Kind
 from xop_lerobot.dataset.curate.figures import FIGURES, KINDS
 from xop_lerobot.dataset.curate.measures import MEASURES, Episode, Measure
+from xop_lerobot.dataset.curate.order_check import OrderCheck
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.dataset.curate.video_check import VideoCheck
 from xop_lerobot.errors import BadDataset, XopError
@@ -67,21 +68,28 @@ def survey(
     """
     wanted = [name for name in FIGURES if name in names]
     measures = [each for each in MEASURES if not set(wanted).isdisjoint(each.figures)]
-    videos = VideoCheck(source) if "readable" in names else None
+    videos = order = None
+    if "readable" in names:
+        videos, order = VideoCheck(source), OrderCheck(source)
     for entry in source.iterate(note):
         if episodes is not None and entry.index not in episodes:
+            if order is not None:
+                order.check(entry, None)
             continue
-        problems: list[str] = []
-        values = _read_facts(source, entry, problems)
-        values |= _measure(source, entry, measures, problems, read_all="readable" in names)
-        if videos is not None:
-            problems += videos.check(entry)
+        problems = list(entry.faults)
+        values = _read_facts(source, entry)
+        more = None if order is None else order.columns
+        measured, rows = _measure(source, entry, measures, problems, more)
+        values |= measured
+        if videos is not None and order is not None:
+            problems += videos.check(entry) if entry.has_rows else ()
             values["readable"] = not problems
+            problems += order.check(entry, rows)
         figures = {name: _clean(values.get(name), name, problems) for name in wanted}
         yield Finding(entry, figures, tuple(dict.fromkeys(problems)))
 
 
-def _read_facts(source: Source, entry: EpisodeEntry, problems: list[str]) -> dict[str, Any]:
+def _read_facts(source: Source, entry: EpisodeEntry) -> dict[str, Any]:
     facts = entry.facts
     settings = facts.get("settings")
     return {
@@ -100,16 +108,21 @@ def _measure(
     entry: EpisodeEntry,
     measures: list[Measure],
     problems: list[str],
-    read_all: bool,
-) -> dict[str, Any]:
+    more: tuple[str, ...] | None,
+) -> tuple[dict[str, Any], Mapping[str, np.ndarray] | None]:
+    """Compute figures; `more` are columns to be read too, of rows that are to be checked.
+
+    Returns:
+        The figures, and the columns; None if one of them cannot be read.
+    """
     columns = {each: each.find_columns(source.features, entry) for each in measures}
     able = {each: names for each, names in columns.items() if names is not None}
-    together = tuple(dict.fromkeys(name for names in able.values() for name in names))
-    if read_all and not together:  # whether the rows are there is to be found out
-        together = ("frame_index",) if "frame_index" in source.features else ()
+    together = tuple(
+        dict.fromkeys((*(name for names in able.values() for name in names), *(more or ())))
+    )
     rows: Mapping[str, np.ndarray] | None = None
     try:
-        if read_all:
+        if more is not None:
             source.check_rows(entry)
     except BadDataset as error:
         problems.append(error.fault)
@@ -127,7 +140,7 @@ def _measure(
             problems.append(error.fault)
         except XopError as error:
             problems.append(f"episode {entry.index}: {error}")
-    return values
+    return values, rows
 
 
 def _compute(

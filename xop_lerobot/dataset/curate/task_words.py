@@ -7,6 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from xop_lerobot.dataset.curate.entries import UNREADABLE
 from xop_lerobot.errors import BadDataset
 
 TASK = "task_index"
@@ -28,7 +29,7 @@ def read_tasks(root: Path) -> dict[int, str]:
     try:
         table = pq.read_table(root / TASKS_FILE)
         numbers = table[TASK].cast(pa.int64()).to_pylist()
-    except (pa.ArrowException, OSError, KeyError) as error:
+    except (*UNREADABLE, KeyError) as error:
         text = (str(error) or type(error).__name__).splitlines()[0]
         raise BadDataset(root, f"{TASKS_FILE} is not readable ({text})") from error
     name = find_words(table.schema)

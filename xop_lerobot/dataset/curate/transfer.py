@@ -21,7 +21,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.utils import DEFAULT_CHUNK_SIZE, DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
 
-from xop_lerobot.dataset.curate.clip import PROVENANCE, Clip, Step, make_facts
+from xop_lerobot.dataset.curate.clip import PROVENANCE, Clip, Step, make_facts, make_refusal
 from xop_lerobot.dataset.curate.episode_stats import (
     Stats,
     StatsReader,
@@ -161,6 +161,8 @@ class _Writer:
 
     def write(self, clip: Clip) -> None:
         """Write one clip as the next episode."""
+        if clip.entry.faults:
+            raise make_refusal(clip)
         parts = self._open(clip)
         start, stop = clip.span
         table = clip.source.read_table(clip.entry).slice(start, stop - start)
@@ -240,7 +242,11 @@ class _Writer:
         """Take over the statistics of what is as it was, and compute the others."""
         features = self.meta.features
         known = {} if clip.is_cut else reader.read(clip.entry.index)
-        stats = {key: value for key, value in known.items() if key in features}
+        stats = {
+            key: value
+            for key, value in known.items()
+            if key in features and all(map(_is_finite, value.values()))
+        }
         numbers = dict(columns)
         for key, feature in features.items():
             if key in stats and key not in columns:
@@ -309,6 +315,10 @@ def _cut_videos(clip: Clip, keys: Iterable[str]) -> dict[str, Cut]:
 def _to_numpy(column: pa.ChunkedArray, feature: Mapping[str, Any]) -> np.ndarray:
     shape = (len(column), *feature["shape"])
     return np.array(column.to_pylist(), feature["dtype"]).reshape(shape)
+
+
+def _is_finite(values: np.ndarray) -> bool:
+    return values.dtype.kind in "biuf" and bool(np.isfinite(values).all())
 
 
 def _plain(stats: Stats) -> Stats:

@@ -8,9 +8,11 @@ still in memory is gone.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from xop_lerobot.dataset.curate.entries import (
     VideoSpan,
     read_entries,
 )
+from xop_lerobot.dataset.curate.order_check import OrderCheck
 from xop_lerobot.dataset.curate.pictures import VideoIndex, index_video
 from xop_lerobot.dataset.curate.row_files import make_rows, make_schema
 from xop_lerobot.dataset.curate.salvage import CannotSalvage, salvage
@@ -83,6 +86,7 @@ def lay_out(root: Path, folder: Path) -> Wreck:
     wreck.source = Source(folder)
     _find_whole(wreck, rows, known, _find_tasks(wreck, rows, known, folder))
     _note_strays(wreck, info)
+    wreck.notes[:] = dict.fromkeys(wreck.notes)  # a fault may be that of two episodes
     return wreck
 
 
@@ -187,43 +191,91 @@ def _find_whole(
     known: dict[int, EpisodeEntry],
     tasks: dict[int, str],
 ) -> None:
-    source, facts = wreck.source, FactsFile(wreck.root)
-    videos, schema = Videos(wreck, known), make_schema(source.features)
+    source = wreck.source
+    found: list[EpisodeEntry] = []
     for index in sorted(rows.keys() | known.keys()):
         entry = known.get(index)
         if index not in rows:
-            wreck.lost[index] = "its rows are gone"
+            is_empty = entry is not None and _count_expected(entry) == 0
+            wreck.lost[index] = "it has no rows" if is_empty else "its rows are gone"
             continue
         file, table = rows[index]
-        length = table.num_rows
         frames = table["frame_index"].to_numpy()
-        if not np.array_equal(frames, np.arange(length)) or (entry and entry.length != length):
-            expected = entry.length if entry else int(frames.max()) + 1
-            wreck.lost[index] = f"it has {length} of {expected} rows"
-            if entry is None:
-                videos.skip(length)
+        expected = (_count_expected(entry) if entry else 0) or int(frames.max()) + 1
+        whole = _describe(wreck, index, entry, file, table, tasks)
+        if not np.array_equal(frames, np.arange(expected)):
+            wreck.lost[index] = f"it has {len(frames)} of {expected} rows"
+            whole = dataclasses.replace(whole, length=expected)  # so many pictures it has
+        elif entry is None and known:
+            wreck.notes.append(f"episode {index} is not in {EPISODES_DIR}: made anew")
+        elif entry is not None and entry.has_rows and entry.file != file:
+            wreck.notes.append(
+                f"episode {index} is in {file}, and not in {entry.file}, as {EPISODES_DIR} says: "
+                "mended"
+            )
+        found.append(whole)
+    _note_faults(wreck, known, found)
+    videos, schema = Videos(wreck, known, found), make_schema(source.features)
+    for entry in found:
+        if entry.index in wreck.lost:
             continue
-        if entry is None:
-            if known:
-                wreck.notes.append(f"episode {index} is not in {EPISODES_DIR}: made anew")
-            spans = videos.claim(length)
-            line = facts.read(index)
-            if line.pop("length", length) != length:
-                line = {}
-            line.pop("episode_index", None)
-            numbers = dict.fromkeys(table["task_index"].to_pylist())
-            names = tuple(tasks.get(number, "") for number in numbers)
-            entry = EpisodeEntry(index, length, names, line, file, spans or {})
-            if spans is None:
-                wreck.lost[index] = "its pictures are gone"
-                continue
-        else:
-            entry = EpisodeEntry(index, length, entry.tasks, entry.facts, file, entry.videos)
-        fault = videos.check(entry) or _check_rows(source, entry, schema)
+        spans = videos.find(entry)
+        if isinstance(spans, str):
+            wreck.lost[entry.index] = spans
+            continue
+        whole = dataclasses.replace(entry, videos=spans, faults=())
+        fault = _check_rows(source, whole, schema)
         if fault:
-            wreck.lost[index] = fault
+            wreck.lost[entry.index] = fault
         else:
-            wreck.entries.append(entry)
+            wreck.entries.append(whole)
+
+
+def _count_expected(entry: EpisodeEntry) -> int:
+    """Count the rows that an episode should have by its metadata; 0 where it does not say."""
+    start, stop = entry.place or (0, 0)
+    return entry.length or max(0, stop - start)
+
+
+def _describe(
+    wreck: Wreck,
+    index: int,
+    entry: EpisodeEntry | None,
+    file: Path,
+    table: pa.Table,
+    tasks: dict[int, str],
+) -> EpisodeEntry:
+    """Describe an episode by its rows, and by its metadata as far as that is there."""
+    length = table.num_rows
+    if entry is not None:
+        return dataclasses.replace(entry, length=length, file=file)
+    facts = FactsFile(wreck.root).read(index)
+    if facts.pop("length", length) != length:
+        facts = {}
+    facts.pop("episode_index", None)
+    numbers = dict.fromkeys(table["task_index"].to_pylist())
+    names = tuple(tasks.get(number, "") for number in numbers)
+    return EpisodeEntry(index, length, names, facts, file)
+
+
+def _list_cameras(source: Source) -> list[str]:
+    return [key for key, each in source.features.items() if each["dtype"] == "video"]
+
+
+def _note_faults(
+    wreck: Wreck, known: Mapping[int, EpisodeEntry], found: Sequence[EpisodeEntry]
+) -> None:
+    """Note what the metadata says wrongly, and what is not numbered as LeRobot takes for granted.
+
+    All of it is made and counted anew.
+    """
+    check, held = OrderCheck(wreck.source), {entry.index: entry for entry in found}
+    for index, entry in known.items():
+        rows = None
+        if index in held and held[index].length == entry.length and index not in wreck.lost:
+            with suppress(BadDataset):  # which is told when the rows are checked
+                rows = wreck.source.read(held[index], check.columns)
+        wreck.notes += (*entry.faults, *check.check(entry, rows))
 
 
 def _check_rows(source: Source, entry: EpisodeEntry, schema: pa.Schema) -> str:
@@ -234,60 +286,140 @@ def _check_rows(source: Source, entry: EpisodeEntry, schema: pa.Schema) -> str:
     return ""
 
 
+@dataclass
+class _Gap:
+    """Pictures of a video, one after another, that the metadata gives to no episode.
+
+    Attributes:
+        file: The video, relative to the dataset's directory.
+        start: The first of them.
+        size: How many they are.
+        is_tail: Whether they are the last of the video, where an unfinished episode's may be.
+        low: They are of episodes after this one.
+        high: They are of episodes before this one.
+        used: How many of them are claimed.
+    """
+
+    file: Path
+    start: int
+    size: int
+    is_tail: bool
+    low: float = -1
+    high: float = np.inf
+    used: int = 0
+
+
 class Videos:
     """Finds the pictures of episodes.
 
+    Where the metadata says where they are, and they are there and nobody else's, it is believed.
+    All others are found by counting: a recorder puts one episode's pictures after the other's
+    into a file, until it begins another one. So what no episode has between the pictures of
+    episodes 3 and 5 is episode 4's, if it is as many as that has rows.
+
     Args:
         wreck: The dataset.
-        known: Episodes whose metadata says where their pictures are.
+        known: Episodes whose metadata is there.
+        found: Episodes of which there are rows, in order; those that are lost have pictures too.
     """
 
-    def __init__(self, wreck: Wreck, known: dict[int, EpisodeEntry]) -> None:
+    def __init__(
+        self, wreck: Wreck, known: Mapping[int, EpisodeEntry], found: Sequence[EpisodeEntry]
+    ) -> None:
         self._root, self._fps = wreck.root, wreck.source.fps
         self._notes = wreck.notes
         self._cache: dict[Path, VideoIndex | None] = {}
-        self._keys = [
-            key for key, each in wreck.source.features.items() if each["dtype"] == "video"
-        ]
-        taken = {span.file for entry in known.values() for span in entry.videos.values()}
-        self._free = {
-            key: [file for file in self._list(key) if file not in taken] for key in self._keys
+        self._keys = _list_cameras(wreck.source)
+        shared = wreck.source.video_use.shared
+        self._faults: dict[int, str] = {}
+        """Why the pictures are not where the metadata says, by the episode's index."""
+        for entry in found if self._keys else ():
+            if entry.index in shared:
+                self._faults[entry.index] = shared[entry.index][0]
+            elif entry.videos.keys() != set(self._keys):
+                self._faults[entry.index] = "its pictures are gone"
+            elif entry.index not in wreck.lost:
+                fault = self._check(entry.videos, entry)
+                if fault:
+                    self._faults[entry.index] = fault
+        taken = {
+            index: entry
+            for index, entry in known.items()
+            if index not in self._faults and index not in shared
         }
-        self._used = dict.fromkeys(self._keys, 0)
+        sought = [entry for entry in found if entry.index in self._faults]
+        # Pictures of an episode of which nothing else is left may lie between those of others.
+        there = taken.keys() | self._faults.keys()
+        self._is_strict = there != set(range(len(there)))
+        self._spans: dict[int, dict[str, VideoSpan]] = {entry.index: {} for entry in sought}
+        for key in self._keys if sought else ():
+            self._claim(key, self._list_gaps(key, taken), sought)
+
+    def find(self, entry: EpisodeEntry) -> Mapping[str, VideoSpan] | str:
+        """Find the pictures of an episode; say what is wrong where they are not to be had."""
+        fault = self._faults.get(entry.index)
+        if fault is None:
+            return entry.videos
+        spans = self._spans[entry.index]
+        if spans.keys() != set(self._keys) or self._check(spans, entry):
+            return fault
+        if entry.videos or entry.faults:
+            places = ", ".join(f"{span.file} from {span.start:.2f} s on" for span in spans.values())
+            self._notes.append(f"the pictures of episode {entry.index} are found: {places}")
+        return spans
+
+    def _list_gaps(self, key: str, taken: Mapping[int, EpisodeEntry]) -> list[_Gap]:
+        """List the pictures of a camera that are nobody's, file by file."""
+        spans: dict[Path, list[tuple[int, int, int]]] = {}
+        for index, entry in taken.items():
+            span = entry.videos.get(key)
+            if span is not None:
+                start, stop = (round(each * self._fps) for each in (span.start, span.stop))
+                spans.setdefault(span.file, []).append((start, stop, index))
+        gaps: list[_Gap] = []
+        owners: list[int | None] = []  # of what lies there, one after another; None for a gap
+        for file in self._list(key):
+            place, size = 0, self._count(file)
+            for start, stop, index in sorted(spans.get(file, ())):
+                if start > place:
+                    gaps.append(_Gap(file, place, start - place, is_tail=False))
+                    owners.append(None)
+                owners.append(index)
+                place = max(place, stop)
+            if size > place:
+                gaps.append(_Gap(file, place, size - place, is_tail=True))
+                owners.append(None)
+        places = [place for place, owner in enumerate(owners) if owner is None]
+        for gap, place in zip(gaps, places, strict=True):
+            gap.low = max((each for each in owners[:place] if each is not None), default=-1)
+            gap.high = min((each for each in owners[place:] if each is not None), default=np.inf)
+        return gaps
+
+    def _claim(self, key: str, gaps: list[_Gap], sought: Sequence[EpisodeEntry]) -> None:
+        """Give what is nobody's to the episodes whose pictures are sought, all in their order."""
+        claims: list[tuple[EpisodeEntry, _Gap, int]] = []
+        number = 0
+        for entry in sought:
+            while number < len(gaps) and entry.index > gaps[number].low:
+                gap = gaps[number]
+                if entry.index < gap.high and gap.used + entry.length <= gap.size:
+                    claims.append((entry, gap, gap.start + gap.used))
+                    gap.used += entry.length
+                    break
+                number += 1
+        for gap in gaps[:number]:
+            if 0 < gap.used < gap.size and gap.is_tail:
+                self._notes.append(
+                    f"{gap.file}: {gap.size - gap.used} pictures at its end belong to no episode"
+                )
+        for entry, gap, start in claims:
+            if gap.used == gap.size or (gap.is_tail and not self._is_strict):
+                begin, end = (each / self._fps for each in (start, start + entry.length))
+                self._spans[entry.index][key] = VideoSpan(gap.file, begin, end)
 
     def _list(self, key: str) -> list[Path]:
         files = (self._root / "videos" / key).glob("*/*.mp4")
         return sorted(file.relative_to(self._root) for file in files)
-
-    def claim(self, length: int) -> dict[str, VideoSpan] | None:
-        """Find the pictures of the next episode, of `length` frames; None if they are not there.
-
-        A recorder puts one episode's after the other's into a file, until it begins another one.
-        """
-        spans: dict[str, VideoSpan] = {}
-        for key in self._keys:
-            files = self._free[key]
-            while files:
-                frames, used = self._count(files[0]), self._used[key]
-                if used + length <= frames:
-                    break
-                if used < frames:
-                    self._notes.append(
-                        f"{files[0]}: {frames - used} pictures at its end belong to no episode"
-                    )
-                files.pop(0)
-                self._used[key] = 0
-            if not files:
-                return None
-            start = self._used[key] / self._fps
-            spans[key] = VideoSpan(files[0], start, start + length / self._fps)
-        self.skip(length)
-        return spans
-
-    def skip(self, length: int) -> None:
-        """Pass over the pictures of an episode that is lost."""
-        for key in self._keys:
-            self._used[key] += length
 
     def _count(self, file: Path) -> int:
         index = self._index(file)
@@ -302,9 +434,9 @@ class Videos:
                 self._cache[file] = None
         return self._cache[file]
 
-    def check(self, entry: EpisodeEntry) -> str:
+    def _check(self, spans: Mapping[str, VideoSpan], entry: EpisodeEntry) -> str:
         """Check that the pictures of an episode are there; return what is wrong, or nothing."""
-        for key, span in entry.videos.items():
+        for key, span in spans.items():
             index = self._index(span.file)
             if index is None:
                 return f"its pictures of '{key}' are not readable"
@@ -329,6 +461,11 @@ def _note_strays(wreck: Wreck, info: dict[str, Any]) -> None:
         wreck.notes.append(
             f"{folder.relative_to(root)} holds {count} pictures of an unfinished episode: left out"
         )
+    spans = [span for entry in wreck.entries for span in entry.videos.values()]
+    used = wreck.source.video_use.files | {span.file for span in spans}
+    for path in sorted(root.glob("videos/*/*/*.mp4")):
+        if path.relative_to(root) not in used:
+            wreck.notes.append(f"{path.relative_to(root)} belongs to no episode: left out")
     counted = info.get("total_episodes", 0)
     there = len(wreck.entries)
     if counted != there:
