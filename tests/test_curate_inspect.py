@@ -157,6 +157,37 @@ def test_late_frames_are_those_of_real_time(data):
     assert read_one(data, 1)["late_frames"] is None
 
 
+def test_clock_that_was_set_is_named_and_harms_nothing(data, capsys):
+    wall = 1_700_000_000_000_000_000 + np.arange(FRAMES) * 40_000_000
+    wall[50:] += 3_600_000_000_000
+    set_column(data, 0, "time.wall", wall)
+    wall[50:] -= 3_590_000_000_000  # in lock-step, the machine may have taken ten seconds
+    set_column(data, 1, "time.wall", wall)
+    wall[70:] -= 30_000_000_000
+    set_column(data, 2, "time.wall", wall)
+    code, rows, _ = inspect(data, capsys)
+    assert code == 1
+    assert [row["problems"] for row in rows[:3]] == [
+        ["the clock 'time.wall' was set by +3600 s at row 50 of episode 0; it is replayed without"],
+        [],
+        ["the clock 'time.wall' was set by -30 s at row 70 of episode 2; it is replayed without"],
+    ]
+    assert all(row["readable"] for row in rows)
+
+
+def test_positions_that_32_bits_cannot_hold_are_named(data, capsys):
+    pose = Source(data).read(next(Source(data).episodes), ["operator.head"])["operator.head"]
+    for far, code in ((2000, 0), (5_411_000, 1)):
+        moved = pose + np.array([far, 0, 0, 0, 0, 0, 0], np.float32)
+        set_column(data, 0, "operator.head", moved)
+        found, rows, _ = inspect(data, capsys)
+        assert found == code
+    assert rows[0]["problems"] == [
+        "'operator.head' of episode 0 is up to 5411000 m from the origin, where float32 has steps "
+        "of 0.5 m"
+    ]
+
+
 def test_where_no_facts_are_the_columns_decide(data, made):
     before = [read_one(made, i) for i in range(EPISODES)]
     (data / EPISODES_FILE).unlink()

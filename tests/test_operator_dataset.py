@@ -17,6 +17,8 @@ from xop_lerobot.operator.dataset_recording import (
     make_dataset_recording,
 )
 from xop_lerobot.operator.devices import DeviceConfig, make_device
+from xop_lerobot.operator.row_clock import read_row_clock
+from xop_lerobot.state import FRAMES
 
 FPS = 25
 LENGTH = 20
@@ -138,6 +140,83 @@ def test_robot_without_a_clock_has_the_hosts(broken: np.ndarray) -> None:
         make_dataset_recording(columns, {}, "x")
 
 
+WALL = 1_700_000_000_000_000_000 + np.arange(LENGTH) * 40_000_000
+HOUR = 3_600_000_000_000
+
+
+def set_wall(*sets: tuple[int, int]) -> np.ndarray:
+    """The host's clock, set by so many nanoseconds from so many rows on. Shape (n, 1)."""
+    wall = WALL.copy()
+    for row, by in sets:
+        wall[row:] += by
+    return wall[:, None]
+
+
+@pytest.mark.parametrize(
+    "sets",
+    [
+        [(10, HOUR)],
+        [(10, -HOUR)],
+        [(10, 1_700_000_000_000_000_000)],
+        [(10, -1_700_000_000_000_000_000)],
+        [(10, -500_000_000)],
+        [(10, 1_500_000_000)],
+        [(1, HOUR)],
+        [(5, HOUR), (15, -HOUR)],
+    ],
+)
+def test_clock_that_is_set_loses_no_time_and_no_row(sets, caplog) -> None:
+    columns = make_columns(**{"time.sim": np.zeros((LENGTH, 1)), "time.wall": set_wall(*sets)})
+    recording, rows = make_dataset_recording(columns, {}, "x", FPS)
+    assert rows.tolist() == list(range(LENGTH))
+    assert recording.t == pytest.approx(np.arange(LENGTH) / FPS)
+    assert [record.args[1] for record in caplog.records] == ["time.wall"] * len(sets)
+    assert caplog.records[0].getMessage() == (
+        f"x: time.wall was set by {sets[0][1] / 1e9:+.6g} s at row {sets[0][0]} of what the "
+        "operator drove; it is replayed without this jump."
+    )
+
+
+def test_single_wrong_stamp_costs_its_row_alone(caplog) -> None:
+    wall = set_wall((8, HOUR), (9, -HOUR))
+    columns = make_columns(**{"time.sim": np.zeros((LENGTH, 1)), "time.wall": wall})
+    recording, rows = make_dataset_recording(columns, {}, "x", FPS)
+    assert rows.tolist() == [row for row in range(LENGTH) if row != 8]
+    assert recording.t == pytest.approx(rows / FPS)
+    assert not caplog.records
+
+
+def test_clock_that_stands_still_and_then_is_right_again() -> None:
+    t = np.arange(100) * 0.05
+    t[20:60] = t[19]
+    clock = read_row_clock(t)
+    assert np.flatnonzero(~clock.goes_on).tolist() == list(range(20, 60))
+    assert clock.t[clock.goes_on] == pytest.approx(np.arange(100)[clock.goes_on] * 0.05)
+    assert clock.jumps == ()
+
+
+@pytest.mark.parametrize("step", [0.33, 2.5])
+def test_camera_that_is_slow_plays_slowly(step: float) -> None:
+    """Rows that really came late, all of them, are no jumps."""
+    wall = (np.arange(LENGTH) * step * 1e9).astype(np.int64)
+    columns = make_columns(**{"time.sim": np.zeros((LENGTH, 1)), "time.wall": wall[:, None]})
+    recording, _ = make_dataset_recording(columns, {}, "x", FPS)
+    assert recording.duration == pytest.approx((LENGTH - 1) * step)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-6, 1e-3])
+def test_clock_in_other_units_is_not_believed(unit: float) -> None:
+    """`time.wall` in seconds, milliseconds or microseconds, and not in nanoseconds."""
+    wall = 1000 + np.arange(LENGTH)[:, None] / FPS / (unit * 1e9)
+    columns = make_columns(**{"time.sim": np.zeros((LENGTH, 1)), "time.wall": wall})
+    if unit == 1e-9:
+        with pytest.raises(BadRecording, match=r"no clock of it runs at about 25 Hz\. Tried: time"):
+            make_dataset_recording(columns, {}, "x", FPS)
+    columns["timestamp"] = np.arange(LENGTH)[:, None] / FPS
+    recording, _ = make_dataset_recording(columns, {}, "x", FPS)
+    assert recording.duration == pytest.approx((LENGTH - 1) / FPS)
+
+
 def test_limb_that_is_not_seen_may_hold_anything() -> None:
     tracked = np.ones((LENGTH, 3), bool)
     tracked[5:9, 2] = False
@@ -148,6 +227,14 @@ def test_limb_that_is_not_seen_may_hold_anything() -> None:
     assert recording.poses[5:9, 2, 0] == pytest.approx(4 / FPS)
     with pytest.raises(BadRecording, match=r"right_wrist_pose must be finite"):
         make_dataset_recording(make_columns(**{"operator.right_wrist": wrist}), {}, "x")
+
+
+def test_operator_in_the_coordinates_of_a_map_is_refused() -> None:
+    pose = make_columns()["operator.head"].copy()
+    pose[:, 1] += 5_411_000
+    columns = make_columns(**{f"operator.{name}": pose for name in FRAMES})
+    with pytest.raises(BadRecording, match=r"head_pose\[0\] is 5411000 m from the origin"):
+        make_dataset_recording(columns, {}, "x", FPS)
 
 
 def test_faults_are_named(tmp_path: Path) -> None:

@@ -86,6 +86,21 @@ FAULTS = {
         {"t": np.array([0.0, 0.1, 0.1, 0.2, 0.3])},
         "t must increase strictly, but t[1] = 0.1 s is followed by t[2] = 0.1 s",
     ),
+    "an hour's jump of the clock": (
+        {"t": np.array([0.0, 0.1, 0.2, 3600.3, 3600.4])},
+        "t must be in seconds, from a clock that nobody sets: its steps may be up to 60 s long, "
+        "but t[2] = 0.2 s is followed by t[3] = 3600.3 s",
+    ),
+    "milliseconds since 1970": (
+        {"t": 1.7e12 + 1e5 * np.arange(5)},
+        "t must be in seconds, from a clock that nobody sets: its steps may be up to 60 s long, "
+        "but t[0] = 1.7e+12 s is followed by t[1] = 1.7000001e+12 s",
+    ),
+    "coordinates of a map": (
+        {"left_wrist_pose": altered("left_wrist_pose", (2, 1), 5_411_000.0)},
+        "left_wrist_pose[2] is 5411000 m from the origin, where the 32 bits of a dataset are no "
+        "longer exact to a millimetre. Move the origin, of all poses alike, to within 10000 m",
+    ),
     "quaternion of zeros": (
         {"right_wrist_pose": altered("right_wrist_pose", (3, slice(3, 7)), 0.0)},
         "right_wrist_pose[3, 3:] must be a unit quaternion (qw qx qy qz), its norm is 0",

@@ -199,6 +199,11 @@ FAULTS = {
         make_content(head=[{"t": 0, "position": [0, 1]}]),
         "head[0].position must be a list of 3 numbers, got [0, 1]",
     ),
+    "coordinates of a map": (
+        make_content(head=[{"t": 0, "position": [449_000, 5_411_000, 1.6]}]),
+        "head[0].position is 5411000 m from the origin, where the 32 bits of a dataset are no "
+        "longer exact to a millimetre. Move the origin, of all poses alike, to within 10000 m",
+    ),
     "text": (
         make_content(head=[{"t": 0, "position": [0, "x", 1]}]),
         "head[0].position[1] must be a finite number, got 'x'",

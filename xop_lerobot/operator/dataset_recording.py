@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,11 @@ from xop_lerobot.operator.recording import (
     Recording,
     make_recording,
 )
+from xop_lerobot.operator.row_clock import RowClock, read_row_clock
 from xop_lerobot.state import FRAMES
 from xop_lerobot.transforms import IDENTITY_POSE
+
+logger = logging.getLogger(__name__)
 
 POSE_COLUMNS = tuple(f"operator.{frame}" for frame in FRAMES)
 COLUMNS = {**dict.fromkeys(POSE_COLUMNS, 7), "operator.pinch": 2, "operator.tracked": 3}
@@ -34,7 +38,9 @@ CLOCKS = {"time.sim": 1.0, "time.wall": 1e-9, "timestamp": 1.0}
 without a clock of its own the first stands still."""
 OPTIONAL_COLUMNS = (ENGAGED_COLUMN, "action", *CLOCKS)
 _MOST = 0.9
-"""Share of the rows in which a clock must go on to be used."""
+"""Share of the rows in which a clock must go on, and by itself, to be used."""
+_FAR_OFF = 100.0
+"""A clock that is faster or slower than the dataset's rate by this factor counts in other units."""
 
 
 def is_dataset(path: str | Path) -> bool:
@@ -60,7 +66,9 @@ def load_dataset_recording(root: str | Path, episode: int = 0) -> Recording:
     features = info["features"]
     wanted = choose_columns(root, features)
     arrays = _read_episode(root, wanted, episode, info)
-    return make_dataset_recording(arrays, features, f"{root} (episode {episode})")[0]
+    fps = info.get("fps")
+    fps = fps if isinstance(fps, int | float) and not isinstance(fps, bool) else None
+    return make_dataset_recording(arrays, features, f"{root} (episode {episode})", fps)[0]
 
 
 def choose_columns(root: object, features: Mapping[str, Any]) -> list[str]:
@@ -98,17 +106,21 @@ def _holds_numbers(feature: Mapping[str, Any]) -> bool:
 
 
 def make_dataset_recording(
-    columns: Mapping[str, np.ndarray], features: Mapping[str, Any], source: object
+    columns: Mapping[str, np.ndarray],
+    features: Mapping[str, Any],
+    source: object,
+    fps: float | None = None,
 ) -> tuple[Recording, np.ndarray]:
     """Make a recording of an episode's columns.
 
     It reaches from the first row in which the operator drove to the last. Rows in which the clock
-    stands still or goes back are left out.
+    stands still are left out, and so are the jumps that it makes when somebody sets it.
 
     Args:
         columns: The columns of `choose_columns`. Shapes (n, size).
         features: The dataset's features.
         source: What they came from, for the messages.
+        fps: The dataset's rows a second [Hz], if known; a clock that is far off is not believed.
 
     Returns:
         The recording, and the row of each of its samples. Shape (T,).
@@ -125,14 +137,16 @@ def make_dataset_recording(
     span = np.arange(driven[0], driven[-1] + 1)
     if len(span) < MIN_SAMPLES:
         raise BadRecording(source, "the operator was engaged in a single row of it")
-    t, goes_on = _choose_clock({name: columns[name][span, 0] for name in CLOCKS if name in columns})
-    if t is None:
-        tried = ", ".join(name for name in CLOCKS if name in columns)
-        raise BadRecording(source, f"no clock of it runs. Tried: {tried or '(it has none)'}")
-    rows = span[goes_on]
+    ticks = {name: columns[name][span, 0] for name in CLOCKS if name in columns}
+    clock = _choose_clock(ticks, source, fps)
+    if clock is None:
+        rate = f" at about {fps:g} Hz" if fps else ""
+        tried = ", ".join(ticks) or "(it has none)"
+        raise BadRecording(source, f"no clock of it runs{rate}. Tried: {tried}")
+    rows = span[clock.goes_on]
     tracked = columns["operator.tracked"][rows] > 0
     arrays = {
-        "t": t[goes_on],
+        "t": clock.t[clock.goes_on],
         "left_pinch": columns["operator.pinch"][rows, 0],
         "right_pinch": columns["operator.pinch"][rows, 1],
         "tracked": tracked,
@@ -158,29 +172,36 @@ def _is_pose(poses: np.ndarray) -> np.ndarray:
         return np.isfinite(poses).all(axis=1) & (np.abs(norm - 1) <= NORM_TOLERANCE)
 
 
-def _choose_clock(clocks: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
-    """Choose the best clock that runs.
+def _choose_clock(
+    clocks: Mapping[str, np.ndarray], source: object, fps: float | None
+) -> RowClock | None:
+    """Choose the best clock that runs, at about the rate of the rows; None if there is none.
 
     Args:
         clocks: Columns of `CLOCKS`. Shapes (n,).
-
-    Returns:
-        Its time [s], None if none runs, and the rows in which it went on. Shapes (n,).
+        source: What they came from, for the log.
+        fps: Rows a second [Hz], if known.
     """
     for name, ticks in clocks.items():
-        # Whole nanoseconds since 1970 are too many for a float: from the first on they are not.
-        t = (ticks - ticks[0]) * CLOCKS[name]
-        before = np.concatenate([[-np.inf], np.fmax.accumulate(t)[:-1]])
-        goes_on = np.isfinite(t) & (t > before)
-        if goes_on.sum() >= max(2, _MOST * len(t)):
-            return t, goes_on
-    return None, np.zeros(0, bool)
+        clock = read_row_clock(ticks, CLOCKS[name])
+        count = int(clock.goes_on.sum())
+        if count - len(clock.jumps) < max(2, _MOST * len(ticks)):
+            continue
+        if fps and not 1 / _FAR_OFF < np.ptp(clock.t[clock.goes_on]) * fps / count < _FAR_OFF:
+            continue
+        for row, seconds in clock.jumps:
+            logger.warning(
+                "%s: %s was set by %+.6g s at row %d of what the operator drove; it is replayed "
+                "without this jump.", source, name, seconds, row,
+            )  # fmt: skip
+        return clock
+    return None
 
 
 def _read_info(root: Path) -> dict:
     path = root / "meta" / "info.json"
     try:
-        info = json.loads(path.read_text())
+        info = json.loads(path.read_text(encoding="utf-8"))
         info["features"].keys()
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BadRecording(root, f"meta/info.json is not readable ({error!r})") from error

@@ -23,6 +23,12 @@ OPTIONAL_KEYS = ("tracked", "mode")
 NORM_TOLERANCE = 1e-3
 """How far a quaternion's norm may be from 1 before it counts as a fault."""
 MIN_SAMPLES = 2
+LONGEST_STEP_S = 60.0
+"""Samples of a motion are never farther apart [s]: a clock was set, or counts in other units."""
+FARTHEST_M = 10_000.0
+"""Farthest from the origin of its world that a person may be along an axis [m]. Datasets keep
+positions in 32 bits, as LeRobot shows them, which are exact to a millimetre up to there; in the
+coordinates of a map they are off by half a metre."""
 
 
 @dataclass(frozen=True)
@@ -143,11 +149,21 @@ def make_recording(arrays: Mapping[str, np.ndarray], source: object) -> Recordin
             f"t must increase strictly, but t[{i}] = {t[i]:g} s is followed by "
             f"t[{i + 1}] = {t[i + 1]:g} s",
         )
+    if (steps > LONGEST_STEP_S).any():
+        i = int(np.argmax(steps))
+        raise BadRecording(
+            source,
+            f"t must be in seconds, from a clock that nobody sets: its steps may be up to "
+            f"{LONGEST_STEP_S:g} s long, but t[{i}] = {t[i]:.10g} s is followed by "
+            f"t[{i + 1}] = {t[i + 1]:.10g} s",
+        )
     tracked = _check_tracked(arrays, n, source)
     poses = np.stack([_check_poses(arrays, key, n, source) for key in POSE_KEYS], axis=1)
     pinch = np.stack([_check_pinch(arrays, key, n, source) for key in PINCH_KEYS], axis=1)
     mode = _check_mode(arrays, n, source)
-    return Recording(t - t[0], hold_untracked(poses, tracked), pinch, tracked, mode)
+    poses = hold_untracked(poses, tracked)
+    _check_distances(poses, source)
+    return Recording(t - t[0], poses, pinch, tracked, mode)
 
 
 def hold_untracked(poses: np.ndarray, tracked: np.ndarray) -> np.ndarray:
@@ -204,6 +220,27 @@ def _check_poses(arrays: Mapping[str, np.ndarray], key: str, n: int, source: obj
         )
     poses[:, 3:] /= norm[:, None]
     return poses
+
+
+def _check_distances(poses: np.ndarray, source: object) -> None:
+    """Check that positions are near enough to the origin for a dataset. Shape (T, 3, 7)."""
+    distances = np.abs(poses[:, :, :3]).max(axis=2)
+    if (distances > FARTHEST_M).any():
+        i, limb = np.unravel_index(int(np.argmax(distances)), distances.shape)
+        raise BadRecording(source, describe_distance(f"{POSE_KEYS[limb]}[{i}]", distances[i, limb]))
+
+
+def describe_distance(name: str, distance: float) -> str:
+    """Say of a position that it is too far from the origin, and what to do.
+
+    Args:
+        name: Which.
+        distance: Its largest coordinate [m].
+    """
+    return (
+        f"{name} is {distance:.0f} m from the origin, where the 32 bits of a dataset are no longer "
+        f"exact to a millimetre. Move the origin, of all poses alike, to within {FARTHEST_M:.0f} m"
+    )
 
 
 def _check_pinch(arrays: Mapping[str, np.ndarray], key: str, n: int, source: object) -> np.ndarray:

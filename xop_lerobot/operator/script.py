@@ -12,6 +12,7 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import XopError
 from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
+from xop_lerobot.operator.recording import FARTHEST_M, describe_distance
 from xop_lerobot.state import FRAMES
 from xop_lerobot.transforms import quat_from_rpy
 from xop_lerobot.yaml_words import load_yaml
@@ -123,7 +124,7 @@ def load_script(name: str) -> Script:
         choices = ", ".join(list_scripts())
         raise BadScript(name, f"there is no such file. Built-in scripts: {choices}")
     try:
-        content = load_yaml(path.read_text())
+        content = load_yaml(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
         fault = " ".join(str(error).split())
         raise BadScript(path, f"it is not readable YAML ({fault})") from error
@@ -233,6 +234,9 @@ class _Reader:
                         self.source, f"{here}.quat (qw qx qy qz) must have norm 1, got {norm:g}"
                     )
                 quat = quat / norm
+            farthest = float(np.abs(position).max())
+            if farthest > FARTHEST_M:
+                raise BadScript(self.source, describe_distance(f"{here}.position", farthest))
             poses.append(np.concatenate([position, quat]))
         return Track(np.array([time for _, time, _ in rows]), np.array(poses))
 
