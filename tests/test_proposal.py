@@ -392,8 +392,6 @@ def test_heading_errors_of_one_orientation_equal_those_of_a_batch(seed):
     quat = quat_multiply(turn, goal)
     error, jacobian = linearise_heading(goal, quat)
     np.testing.assert_allclose(error, heading_error(goal, quat), atol=1e-9)
-    if abs(quat_rotate(quat, np.array([1.0, 0, 0]))[2]) > 0.99:
-        return  # looking straight up, a frame has no heading
     steps = 1e-6 * np.eye(3)
     numeric = [
         -(

@@ -17,7 +17,13 @@ from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.route import RoutePlanner
 from xop_lerobot.state import Goal
-from xop_lerobot.transforms import make_pose, pose_multiply, quat_from_yaw, quat_yaw
+from xop_lerobot.transforms import (
+    make_pose,
+    pose_multiply,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_yaw,
+)
 
 RESTING = 0.03  # how far the head is ahead of the base [m]
 LEAN = 0.1  # what is left to the torso [m]
@@ -316,3 +322,16 @@ def test_the_base_turns_with_a_goal_that_turns(rby1, planner):
     assert turned[0] == 0
     assert turned[-1] > 0.3
     assert sorted(turned) == turned
+
+
+@pytest.mark.parametrize("roll", [-0.4, 0.0, 0.4])
+def test_a_goal_that_looks_straight_down_has_a_heading(planner, rby1, roll):
+    """It is that of the crown: the base neither turns round nor away from it."""
+    qpos, head = place(rby1)
+    ends = []
+    for pitch in np.linspace(1.2, 1.9, 8):
+        goal = make_pose([2.0 + RESTING, 0, 0.7], quat_from_rpy(roll, pitch, 0.0))
+        pose = make_pose(head[:3], quat_from_rpy(roll, pitch - 0.1, 0.0))
+        ends.append(planner.plan(qpos, (0.0, 0.0), "head", pose, goal, 4.0, room=0.2).headings[-1])
+    assert np.abs(np.diff(ends)).max() < 0.2
+    assert np.abs(ends).max() < 0.9

@@ -126,15 +126,21 @@ def test_rotation_error_of_a_yaw_is_about_z_whatever_the_tilt():
     np.testing.assert_allclose(rotation_error(goal, tilted), [0, 0, 0.2], atol=1e-12)
 
 
-@given(angles, st.tuples(*[st.floats(-1e-4, 1e-4)] * 3).map(np.array))
-def test_a_small_heading_error_is_the_rotation_error_in_the_headings_axes(yaw, turn):
-    q = quat_from_yaw(yaw)
+@given(quats, st.tuples(*[st.floats(-1e-4, 1e-4)] * 3).map(np.array))
+def test_a_small_heading_error_is_the_rotation_error(q, turn):
+    """Also of a head that looks straight up or down, and of a hand in any pose."""
     goal = quat_multiply(quat_exp(turn), q)
-    in_heading = quat_rotate(quat_conjugate(q), rotation_error(goal, q))
-    np.testing.assert_allclose(heading_error(goal, q), in_heading, atol=1e-7)
+    np.testing.assert_allclose(heading_error(goal, q), rotation_error(goal, q), atol=1e-7)
 
 
-@given(angles, angles, st.floats(-0.8, 0.8), st.floats(-0.8, 0.8))
+@given(quats, st.floats(-2.5, 2.5), st.floats(-2.0, 2.0), angles)
+def test_a_heading_error_is_a_tilt_and_then_a_turn(q, turn, tilt, axis):
+    leaned = tilt * np.array([np.cos(axis), np.sin(axis), 0.0])
+    goal = quat_multiply(quat_from_yaw(turn), quat_multiply(quat_exp(leaned), q))
+    np.testing.assert_allclose(heading_error(goal, q), [*leaned[:2], turn], atol=1e-6)
+
+
+@given(angles, angles, st.floats(-np.pi, np.pi), st.floats(-1.5, 1.5))
 def test_who_leans_the_same_way_in_another_heading_has_no_error_of_tilt(yaw, other, roll, pitch):
     goal, q = quat_from_rpy(roll, pitch, yaw), quat_from_rpy(roll, pitch, other)
     error = heading_error(goal, q)

@@ -117,3 +117,17 @@ def test_goals_are_left_untouched():
     compute_wrist_goals(GOALS, make_pose([1, 1, 1], quat_exp([0.1, 0.2, 0.3])))
     for name, pose in copies.items():
         np.testing.assert_array_equal(GOALS[name], pose)
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.35, 0.6])
+def test_a_head_that_bends_down_past_the_vertical_makes_no_hand_jump(roll):
+    """The head of the robot is behind that of the operator, in its place and in its nod."""
+    before = None
+    for nod in np.linspace(0.0, 2.2, 111):
+        head = make_pose(HEAD[:3], quat_from_rpy(roll, nod, 0.3))
+        robot = make_pose([0.0, 0.0, 1.1], quat_from_rpy(roll, 0.9 * nod, 0.3))
+        wrists = compute_wrist_goals({**GOALS, "head": head}, robot)
+        if before is not None:
+            for name, wrist in wrists.items():
+                assert np.linalg.norm(wrist[:3] - before[name][:3]) < 0.02  # at 1 m, in 0.02 rad
+        before = wrists

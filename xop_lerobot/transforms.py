@@ -9,6 +9,7 @@ import numpy as np
 
 IDENTITY_POSE = np.array([0.0, 0, 0, 1, 0, 0, 0])
 IDENTITY_POSE.setflags(write=False)
+_TINY = 1e-12
 
 
 def quat_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -191,44 +192,47 @@ def rotation_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def heading_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    r"""Error of roll and pitch, each in its own heading, and of the heading [rad].
+    r"""Error of the tilt, and of the heading [rad].
 
-    With :math:`R = R_z(\psi) T`: :math:`(\log(T_{goal} T^{-1})_{x,y},\ \psi_{goal} - \psi)`. For
-    small errors it is `rotation_error` in heading axes; but a robot that faces away from its goal
-    is not asked to lean sideways because the operator leans forward.
+    What turns `quat` into `goal` is a tilt s about a horizontal axis, then a turn ψ about the
+    vertical: :math:`q_{goal} q^{-1} = R_z(\psi)\,s`. The error is :math:`(\log(s)_{x,y},\ \psi)` in
+    the world's axes. For small errors it is `rotation_error`; but a robot that faces away from
+    its goal is not asked to lean sideways because the operator leans forward: who leans the same
+    way in another heading has no error of the tilt. It needs no heading of either, so that a head
+    that looks straight down, or a hand that points there, has an error like any other. Where the
+    tilt is half a turn there is no ψ.
 
     Shapes (..., 4) and (..., 4) -> (..., 3).
     """
-    yaw_goal, yaw = quat_yaw(goal), quat_yaw(quat)
-    tilt_goal = quat_multiply(quat_from_yaw(-yaw_goal), goal)
-    tilt = quat_multiply(quat_from_yaw(-yaw), quat)
-    error = rotation_error(tilt_goal, tilt)
-    return np.concatenate([error[..., :2], wrap_angle(yaw_goal - yaw)[..., None]], axis=-1)
+    w, x, y, z = _split(quat_multiply(goal, quat_conjugate(quat)))
+    upright, level = np.hypot(w, z), np.hypot(x, y)
+    angle = 2 * np.arctan2(level, upright)
+    scale = np.where(level > _TINY, angle / np.maximum(level, _TINY), 2.0)
+    scale = scale / np.maximum(upright, _TINY)
+    return _join(scale * (w * x + z * y), scale * (w * y - z * x), _double_angle(z, w))
 
 
 def compute_heading_squares(goal: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Squares of `heading_error`: of the heading's, and of roll's and pitch's together [rad²].
+    r"""Squares of `heading_error`: of the heading's, and of the tilt's [rad²].
 
-    Without the vector itself, in a quarter of its time. The tilts' error is
-    :math:`R_z(-\psi_{goal})\,d\,R_z(\psi)` with :math:`d = q_{goal} q^{-1}`: turns about Z leave
-    :math:`d_x^2 + d_y^2` alone, and turn :math:`d_w + i d_z` by half the error of the heading.
+    Without the vector itself, in a fraction of its time.
 
     Shapes (..., 4) and (..., 4) -> (...), (...).
     """
     gw, gx, gy, gz = _split(goal)
     w, x, y, z = _split(quat)
-    turn = (quat_yaw(goal) - quat_yaw(quat) + np.pi) % (2 * np.pi) - np.pi
     dw = gw * w + gx * x + gy * y + gz * z
     dx = gx * w - gw * x + gz * y - gy * z
     dy = gy * w - gw * y + gx * z - gz * x
     dz = gz * w - gw * z + gy * x - gx * y
-    level = dx * dx + dy * dy
-    c, s = np.cos(turn / 2), np.sin(turn / 2)
-    ew, ez = c * dw + s * dz, c * dz - s * dw
-    sine = np.sqrt(level + ez * ez)
-    angle = 2 * np.arctan2(sine, np.abs(ew))
-    scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0)
-    return turn * turn, scale * scale * level
+    turn = _double_angle(dz, dw)
+    tilt = 2 * np.arctan2(np.sqrt(dx * dx + dy * dy), np.sqrt(dw * dw + dz * dz))
+    return turn * turn, tilt * tilt
+
+
+def _double_angle(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Twice the angle of a quaternion's two entries, its sign left aside, in [-pi, pi]."""
+    return 2 * np.arctan2(np.where(cosine < 0, -sine, sine), np.abs(cosine))
 
 
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray:

@@ -15,6 +15,7 @@ from xop_lerobot.retarget.plan import Plan, Retargeter
 from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
 from xop_lerobot.state import Goal, RobotState
 from xop_lerobot.transforms import (
+    compute_heading,
     make_pose,
     quat_from_yaw,
     quat_multiply,
@@ -90,14 +91,14 @@ class DirectRetargeter(Retargeter):
     def _turn_to_base(self, state: RobotState, goal: Goal) -> np.ndarray:
         """The head's goal, turned about the vertical to where the waist can look. Shape (7,)."""
         pose, base = goal.poses["head"], float(quat_yaw(state.qpos[3:7]))
-        beside = float(wrap_angle(quat_yaw(pose[3:]) - base))
+        beside = float(wrap_angle(compute_heading(pose[3:]) - base))
         waist = self._turns_waist & self.command_model.acting(goal.mode)
         low, high = self.space.low[waist].sum(), self.space.high[waist].sum()
         if goal.mode is Mode.MOBILE:  # what the waist has no part in, the yaw rate has to do
             self._drifted = beside - float(np.clip(beside, low, high))
         beside = float(np.clip(wrap_angle(beside - self._drifted), low, high))
         wanted = base + beside
-        back = wanted - float(quat_yaw(pose[3:]))
+        back = wanted - float(compute_heading(pose[3:]))
         return make_pose(pose[:3], quat_multiply(quat_from_yaw(back), pose[3:]))
 
     def _map_velocity(self, state: RobotState, goal: Goal) -> np.ndarray:
@@ -105,7 +106,7 @@ class DirectRetargeter(Retargeter):
         velocity = goal.velocities.get("head", np.zeros(6))
         if goal.mode is Mode.STATIONARY or "head" not in goal.poses:
             return self.space.neutral
-        yaw = quat_yaw(goal.poses["head"][3:])
+        yaw = compute_heading(goal.poses["head"][3:])
         forward = np.cos(yaw) * velocity[0] + np.sin(yaw) * velocity[1]
         left = np.cos(yaw) * velocity[1] - np.sin(yaw) * velocity[0]
         values = {Acts.FORWARD: forward, Acts.LEFT: left, Acts.TURN: velocity[5]}

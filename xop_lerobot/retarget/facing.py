@@ -9,7 +9,7 @@ import numpy as np
 
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.costs.lateral import compute_facing
-from xop_lerobot.transforms import quat_yaw
+from xop_lerobot.transforms import compute_heading, quat_yaw
 
 
 class FacingRule:
@@ -49,7 +49,7 @@ class FacingRule:
             missing = goals[0, :2] - poses[name][:2]
             velocity, look = missing / dt, heading
             if name not in self._hands:
-                look = float(quat_yaw(goals[0, 3:]))
+                look = float(compute_heading(goals[0, 3:]))
                 end = goals[0, :2] + (pivot - self._resting[name]) * _direction(look)
                 velocity = (end - qpos[:2] - pivot * _direction(heading)) / dt
             speed = float(np.hypot(*missing)) / dt

@@ -30,7 +30,7 @@ class ProposalWeights:
 
     Attributes:
         position: Of the position error along x, y, z [1/m].
-        orientation: Of roll, pitch and heading, as in `heading_error` [1/rad].
+        orientation: Of the tilt about X and Y and of the heading, as in `heading_error` [1/rad].
         effort: Of the command's distance from neutral, over its scale [1].
         change: Of its distance from the executed command, over its scale [1].
         support: Of the centre of mass beyond the support area [1/m].

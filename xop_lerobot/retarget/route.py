@@ -11,7 +11,7 @@ import numpy as np
 
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.footprint import Footprint
-from xop_lerobot.transforms import quat_yaw
+from xop_lerobot.transforms import compute_heading, quat_yaw
 
 _DT = 0.04  # step of the simulated way [s]
 _MAX_SPEED, _ACCELERATION, _BRAKING = 1.2, 1.5, 1.0  # [m/s], [m/s²], [m/s²]
@@ -166,7 +166,7 @@ class RoutePlanner:
             carried = (self._resting[name] - self._pivot, 0.0)
             turning = min(max((abs(turn_rate) - _RESTING) / (_TURNING - _RESTING), 0.0), 1.0)
             twist = min(_MAX_TWIST + turning * (_TURNING_TWIST - _MAX_TWIST), room)
-            aim = _Aim(gx, gy, float(quat_yaw(goal[3:])), twist, carried)
+            aim = _Aim(gx, gy, float(compute_heading(goal[3:])), twist, carried)
         count = math.ceil(duration / _DT) + 1
         way = _simulate(aim, x, y, heading, speeds, count)
         if self._footprint is not None and math.dist(way[0, :2], (gx, gy)) > _DETOUR_FROM:
@@ -183,7 +183,7 @@ class RoutePlanner:
         turns = np.zeros(count)
         if name not in self._hands:
             limit = min(_WAIST_LIMIT, room + _ROOM_SPARE)
-            turns = _unwind(float(quat_yaw(pose[3:])) - heading, aim.look, way[:, 2], limit)
+            turns = _unwind(float(compute_heading(pose[3:])) - heading, aim.look, way[:, 2], limit)
         return Route(np.arange(count) * _DT, offsets, way[:, 2], turns, share)
 
     def _find_free(self, way: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:

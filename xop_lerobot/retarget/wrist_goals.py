@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from xop_lerobot.transforms import (
+    compute_heading,
     make_pose,
     pose_inverse,
     pose_multiply,
     quat_exp,
     quat_from_yaw,
     quat_multiply,
-    quat_yaw,
     rotation_error,
 )
 
@@ -52,7 +52,7 @@ def compute_wrist_goals(
 
 def _level(pose: np.ndarray) -> np.ndarray:
     """Place and heading of a pose, without its tilt. Shape (7,)."""
-    return make_pose(pose[:3], quat_from_yaw(quat_yaw(pose[3:])))
+    return make_pose(pose[:3], quat_from_yaw(compute_heading(pose[3:])))
 
 
 def _approach(start: np.ndarray, end: np.ndarray, max_offset: float, max_turn: float) -> np.ndarray:
