@@ -76,6 +76,7 @@ def make_evaluation(seed: int = 0, **fields) -> Evaluation:
         "weights": WEIGHTS,
         "upright": ("left_wrist",),
         "drives": True,
+        "balance": None,
     }
     names = {field.name for field in dataclasses.fields(Evaluation)}
     return Evaluation(**{name: (values | fields)[name] for name in names})

@@ -114,6 +114,13 @@ class Morphology(ABC):
     way [rad]; infinite where a policy, not a servo, follows the command."""
     has_stiff_body: bool = False
     """Whether the joints of the command are on stiff servos that do just as they are told."""
+    posture_limits: Mapping[str, tuple[float, float]] = {}
+    """Angles within which joints of the command are kept [rad] wherever a goal does not need
+    more, by entry: the knees that it is to bend."""
+    load_share: float = 0.85
+    """Share of its largest torque that a joint of a stiff body may need to hold a posture [1]."""
+    standing_reach: float = 0.3
+    """How far from where it rests the head of a robot that stands is led [m]."""
 
     hull_points: dict[str, float] = {}
     """Sites on the hull of the robot and the radius around each [m], for obstacles."""

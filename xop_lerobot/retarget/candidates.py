@@ -15,7 +15,9 @@ from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.offset import OffsetObserver
+from xop_lerobot.retarget.posture_guide import Served
 from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights, pace
+from xop_lerobot.retarget.static_load import StaticLoad
 from xop_lerobot.state import Goal, RobotState
 
 
@@ -29,6 +31,7 @@ class Candidates:
         command_model: What a decision does.
         offset: Where the robot rests beside its command.
         support: Area over which the centre of mass stays, None for a robot that balances itself.
+        load: What joints bear of the weight above them, None where that does not count.
 
     Attributes:
         proposals: The kinematic proposal of each mode.
@@ -42,8 +45,10 @@ class Candidates:
         command_model: CommandModel,
         offset: OffsetObserver,
         support: SupportArea | None,
+        load: StaticLoad | None = None,
     ) -> None:
-        self._morphology, self._model, self._support = morphology, model, support
+        self._morphology, self._model = morphology, model
+        self._support, self._load = support, load
         self._decision, self._command_model, self._offset = decision, command_model, offset
         self._direct: DirectRetargeter | None = None
         self.proposals: dict[Mode, KinematicProposal] = {}
@@ -60,6 +65,7 @@ class Candidates:
                 make_proposal_weights(config.weights, upright=upright),
                 self._support,
                 self._morphology.base_body,
+                self._load,
             )
             for mode, config in configs.items()
         }
@@ -79,6 +85,7 @@ class Candidates:
         executed: np.ndarray,
         drift: np.ndarray,
         facing: np.ndarray,
+        served: Served | None = None,
     ) -> np.ndarray:
         """Compute the kinematic proposal, or the executed command where it is not asked for.
 
@@ -91,12 +98,20 @@ class Candidates:
             executed: Decision being executed. Shape (n,).
             drift: Drift of the base. Shape (3,).
             facing: Where a base on wheels shall face. Shape (2,).
+            served: The posture for the head's goal, None where there is none.
 
         Returns:
             Decision. Shape (n,).
         """
         if "proposal" not in config.candidates and config.control_reference != "proposal":
             return executed
+        natural, free = None, None
+        if served is not None:
+            natural = served.natural
+            if served.detour:  # the posture is taken up straight; wheels do the rest
+                reach = self._decision.space.compute_max_rate(mode, executed) * config.proposal_s
+                natural = start = pace(executed, natural, reach)
+                free = self._command_model.acting(mode) & self._command_model.is_velocity()
         proposal = self.proposals[mode].solve(
             state.qpos,
             {name: poses[0] for name, poses in then.items()},
@@ -108,6 +123,9 @@ class Candidates:
             offset=self._offset.offset,
             settled=self._offset.settled,
             facing=facing,
+            free=free,
+            natural=natural,
+            balance=None if served is None else served.balance,
         )
         return proposal if np.isfinite(proposal).all() else executed
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from xop_lerobot.command import CommandSpace, Mode
 from xop_lerobot.morphology.effect import Acts, Effect
+from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.transforms import (
     quat_from_yaw,
     quat_multiply,
@@ -18,6 +19,7 @@ from xop_lerobot.transforms import (
 
 _TWIST = (Acts.FORWARD, Acts.LEFT, Acts.TURN)
 _TURN = 2
+_ALONG = 0.99  # cosine of the angle within which a joint turns about an axis
 
 
 class CommandModel:
@@ -313,3 +315,30 @@ class CommandModel:
         future[1] += self.pivot * (math.sin(yaw) - math.sin(end))
         c, n = math.cos(turn * dt / 2), math.sin(turn * dt / 2)
         future[3:7] = c * w - n * z, c * x - n * y, c * y + n * x, c * z + n * w
+
+
+def find_joints_along(
+    morphology: Morphology, model: mujoco.MjModel, command_model: CommandModel, axis: int
+) -> np.ndarray:
+    """Which entries of the command turn a joint about an axis of the robot, as it stands.
+
+    Args:
+        morphology: The robot.
+        model: Its model.
+        command_model: What the entries do.
+        axis: 0 ahead (a roll), 1 to the left (a nod), 2 upwards (a turn).
+
+    Returns:
+        Shape (k,), bool.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[: len(morphology.standing_qpos())] = morphology.standing_qpos()
+    mujoco.mj_kinematics(model, data)
+    commands = {effect.joint for effect in morphology.effects}
+    along = [
+        effect.acts is Acts.JOINT
+        and effect.joint in commands
+        and abs(data.xaxis[model.joint(effect.joint).id, axis]) > _ALONG
+        for effect in command_model.effects
+    ]
+    return np.array(along)

@@ -43,6 +43,7 @@ class CostWeights:
         terminal: w_f, factor on the tracking cost at the end of the horizon [1].
         support: Squared distance of the zero-moment point out of the safe support area [1/m²].
         lean: Squared distance of the centre of mass from where it rests on the base [1/m²].
+        load: Squared static torque of a joint beyond its share of what its motor can [1].
         lateral: Squared angle of a base on wheels to where it shall face [1/rad²].
         fall: Squared tilt of the base over the safe one, and height under it [1].
     """
@@ -63,6 +64,7 @@ class CostWeights:
     fall: float = 100.0
     support: float = 1000.0
     lean: float = 0.0
+    load: float = 10.0
     lateral: float = 0.0
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
 from xop_lerobot.retarget.plan import Plan, Retargeter
 from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
 from xop_lerobot.state import Goal, RobotState
@@ -22,8 +22,6 @@ from xop_lerobot.transforms import (
     quat_yaw,
     wrap_angle,
 )
-
-_UPRIGHT = 0.99  # share of a joint's axis that is vertical, where it turns what is above it
 
 
 class DirectRetargeter(Retargeter):
@@ -54,7 +52,7 @@ class DirectRetargeter(Retargeter):
         self.proposal = KinematicProposal(
             model, self.command_model, {"head": site}, ProposalWeights(position=(0.0, 0.0, 1.0))
         )
-        self._turns_waist = _find_vertical_joints(morphology, model)
+        self._turns_waist = find_joints_along(morphology, model, self.command_model, axis=2)
         self._last = self.space.neutral
         self._drifted = 0.0  # heading that the waist had no part in when last in motion [rad]
 
@@ -112,15 +110,3 @@ class DirectRetargeter(Retargeter):
         values = {Acts.FORWARD: forward, Acts.LEFT: left, Acts.TURN: velocity[5]}
         command = np.array([values.get(e.acts, 0.0) for e in self.command_model.effects])
         return np.where(self.command_model.acting(goal.mode), command, self.space.neutral)
-
-
-def _find_vertical_joints(morphology: Morphology, model: mujoco.MjModel) -> np.ndarray:
-    """Which entries of the command turn a joint that stands upright. Shape (k,), bool."""
-    data = mujoco.MjData(model)
-    data.qpos[: len(morphology.standing_qpos())] = morphology.standing_qpos()
-    mujoco.mj_kinematics(model, data)
-    upright = [
-        effect.acts is Acts.JOINT and abs(data.xaxis[model.joint(effect.joint).id, 2]) > _UPRIGHT
-        for effect in morphology.effects
-    ]
-    return np.array(upright)

@@ -31,6 +31,7 @@ class FacingRule:
         then: Mapping[str, np.ndarray],
         dt: float,
         room: float = math.inf,
+        ahead: Mapping[str, float] | None = None,
     ) -> np.ndarray:
         """Compute where the base shall face. A hand looks nowhere: for it, as it faces now.
 
@@ -40,6 +41,7 @@ class FacingRule:
             then: Its goal in `dt`. Shapes (1, 7).
             dt: Time to get there [s].
             room: How far the arms let the waist twist [rad].
+            ahead: How far ahead of the base frames will be, where not as at rest [m].
 
         Returns:
             Direction in the world, as long as it counts. Shape (2,).
@@ -50,7 +52,8 @@ class FacingRule:
             velocity, look = missing / dt, heading
             if name not in self._hands:
                 look = float(compute_heading(goals[0, 3:]))
-                end = goals[0, :2] + (pivot - self._resting[name]) * _direction(look)
+                resting = (ahead or {}).get(name, self._resting[name])
+                end = goals[0, :2] + (pivot - resting) * _direction(look)
                 velocity = (end - qpos[:2] - pivot * _direction(heading)) / dt
             speed = float(np.hypot(*missing)) / dt
             return compute_facing(heading, velocity, look, speed, room)

@@ -15,6 +15,7 @@ from xop_lerobot.retarget.config import MpcConfig
 from xop_lerobot.retarget.facing import FacingRule
 from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.retarget.horizon_goals import hold_near, preview
+from xop_lerobot.retarget.posture_guide import HEAD, Served
 from xop_lerobot.retarget.route import RoutePlanner
 from xop_lerobot.retarget.twist_room import TwistRoom
 from xop_lerobot.state import Goal
@@ -64,6 +65,7 @@ class Guidance:
         goal: Goal,
         config: MpcConfig,
         time: float,
+        served: Served | None = None,
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Compute the goals at `compute_times`, and where a base on wheels shall face at the end.
 
@@ -74,24 +76,28 @@ class Guidance:
             goal: The goal now.
             config: Parameters of the mode.
             time: Time of `qpos` [s].
+            served: The posture for the head's goal, None where there is none.
 
         Returns:
             Poses, shapes (H + 3, 7), and a direction in the world, as long as it counts: zero
             where none does. Shape (2,).
         """
         times = compute_times(config)
+        ahead = {} if served is None else {HEAD: served.ahead}
         name = next((name for name in poses if name in goal.poses), None)
         drives = name is not None and self._drives(goal.mode)
         room = self._room.compute(qpos, time) if drives and self._room is not None else math.inf
         if drives and _compute_speed(goal, name) < _STILL:
             twist = self._command_model.compute_twist(executed)
-            return self._lead_along_route(qpos, twist, poses, goal, name, times, config, room)
+            return self._lead_along_route(
+                qpos, twist, poses, goal, name, times, config, room, ahead
+            )
         near = hold_near(goal, poses, config.reach)
         goals = preview(near, tuple(poses), times, config.preview_s)
         if not drives:
             return goals, np.zeros(2)
         then = {each: track[-1:] for each, track in goals.items()}
-        return goals, self._facing.compute(qpos, poses, then, config.proposal_s, room)
+        return goals, self._facing.compute(qpos, poses, then, config.proposal_s, room, ahead)
 
     def _drives(self, mode: Mode) -> bool:
         """Whether wheels are among what may be moved in `mode`."""
@@ -110,6 +116,7 @@ class Guidance:
         times: np.ndarray,
         config: MpcConfig,
         room: float,
+        ahead: Mapping[str, float],
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Goals where the base will have carried the frame `name`; the others go with it."""
         route = self._routes.plan(
@@ -121,6 +128,7 @@ class Guidance:
             duration=max(_LOOK_AHEAD, float(times[-2:].max())),
             turn_rate=float(goal.velocities[name][5]) if name in goal.velocities else 0.0,
             room=room,
+            ahead=ahead.get(name),
         )
         offsets, turns = route.offsets_at(times), quat_from_yaw(route.turns_at(times))
         goals = preview(goal, tuple(poses), times, config.preview_s)

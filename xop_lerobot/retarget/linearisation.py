@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.errors import UnknownName
+from xop_lerobot.retarget.static_load import StaticLoad
 
 
 def find_site(model: mujoco.MjModel, name: str) -> int:
@@ -65,6 +66,10 @@ class Linearisation:
         jacobian = np.empty((3, self.model.nv))
         mujoco.mj_jacSubtreeCom(self.model, self._data, jacobian, body)
         return self._data.subtree_com[body], jacobian
+
+    def compute_load(self, load: StaticLoad) -> tuple[np.ndarray, np.ndarray]:
+        """Static loads beyond their share (n,), and their Jacobian (n, nv)."""
+        return load.linearise_excess(self._data)
 
 
 class Placement:

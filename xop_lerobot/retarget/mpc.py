@@ -23,14 +23,15 @@ from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.drift import DriftObserver
 from xop_lerobot.retarget.footprint import Footprint
-from xop_lerobot.retarget.guidance import Guidance
-from xop_lerobot.retarget.horizon_goals import hold_level
+from xop_lerobot.retarget.guidance import Guidance, compute_times
+from xop_lerobot.retarget.horizon_goals import hold_level, preview
 from xop_lerobot.retarget.intervention import Verdict, judge
 from xop_lerobot.retarget.linearisation import find_sites_on
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.offset import OffsetObserver
 from xop_lerobot.retarget.optimizer import SamplingOptimizer, build_optimizer
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
+from xop_lerobot.retarget.posture_guide import HEAD, PostureGuide, Served
 from xop_lerobot.retarget.readings import Readings
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
 from xop_lerobot.retarget.weighting import compute_effective_samples
@@ -93,6 +94,7 @@ class MpcRetargeter(Retargeter):
         resting = {name: float(pose[0]) for name, pose in standing.items()}
         self._footprint = Footprint(morphology, model, self._collision.obstacles.obstacles)
         self._guidance = Guidance(morphology, self.command_model, resting, self._footprint)
+        self._postures = PostureGuide(morphology, model, self.command_model, self.support)
         self.candidates = Candidates(
             morphology,
             self.rollout.model,
@@ -100,11 +102,17 @@ class MpcRetargeter(Retargeter):
             self.command_model,
             self.offset,
             self.support,
+            self._postures.load,
         )
         height = float(morphology.standing_qpos()[2])
         self._fall = FallCost(morphology.fall_tilt, morphology.fall_height, height)
         self.costs: tuple[Cost, ...] = make_costs(
-            morphology, self.command_model, self.support, self._collision, self._fall
+            morphology,
+            self.command_model,
+            self.support,
+            self._collision,
+            self._fall,
+            self._postures.load,
         )
         self.cost_names = tuple(cost.name for cost in self.costs)
         self._rng = np.random.default_rng(config.seed)
@@ -164,6 +172,7 @@ class MpcRetargeter(Retargeter):
                 self.command_model.body, self._last = mask, None
             if constraints is not None:
                 self.constraints = constraints
+            self._postures.configure(new, self.sites)
             self.candidates.configure(new, self.sites, bool(self._find_upright()))
 
     def _make_noise(self, config: MpcConfig) -> np.ndarray:
@@ -207,6 +216,7 @@ class MpcRetargeter(Retargeter):
             self._last = None
             self.candidates.reset()
             self._guidance.reset()
+            self._postures.reset()
             self.drift.reset()
             self.offset.reset(self.decision.join(state.command, state.arms))
             for planner in self._planners.values():
@@ -230,7 +240,12 @@ class MpcRetargeter(Retargeter):
         drift = self.drift.drift
         poses = self.readings.compute_poses(state.qpos, self.sites)
         goal = hold_level(goal, self._find_upright())
-        goals, facing = self._guidance.lead(state.qpos, executed, poses, goal, config, state.time)
+        goal, served = self._serve(state.qpos, executed, goal, config)
+        goals, facing = self._guidance.lead(
+            state.qpos, executed, poses, goal, config, state.time, served
+        )
+        if served is not None:
+            goals[HEAD] = served.move(goals[HEAD])
         then = {name: track[-1:] for name, track in goals.items()}
         proposal = self.candidates.propose(
             state,
@@ -241,8 +256,11 @@ class MpcRetargeter(Retargeter):
             executed=executed,
             drift=drift,
             facing=facing,
+            served=served,
         )
         proposal = np.where(acting, proposal, held)
+        if served is not None and served.detour:
+            goals = self._lead_along(proposal, state.qpos, goals, mode, config, executed, drift)
         candidates = self.candidates.collect(state, goal, executed, proposal, config)
         candidates = np.where(acting, candidates, held)
         noise = self._noise[mode] * acting * _compute_noise_share(poses, goals, config)
@@ -255,7 +273,16 @@ class MpcRetargeter(Retargeter):
         rolled = perf_counter()
         with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
             evaluation = self._evaluate(
-                prediction, commands, mode, goals, executed, proposal, facing, drift, config
+                prediction,
+                commands,
+                mode,
+                goals,
+                executed,
+                proposal,
+                facing,
+                drift,
+                config,
+                None if served is None else served.balance,
             )
             terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
         costs = np.sum(list(terms.values()), axis=0)
@@ -296,6 +323,44 @@ class MpcRetargeter(Retargeter):
             },
         )
 
+    def _serve(
+        self, qpos: np.ndarray, executed: np.ndarray, goal: Goal, config: MpcConfig
+    ) -> tuple[Goal, Served | None]:
+        """The goal where the robot can serve it, and the posture for it."""
+        if HEAD not in self.sites or HEAD not in goal.poses:
+            return goal, None
+        offset, settled = self.offset.offset, self.offset.settled
+        goal = self._postures.hold(goal, qpos, executed, offset, settled)
+        then = preview(goal, (HEAD,), np.array([config.proposal_s]), config.preview_s)[HEAD][0]
+        return goal, self._postures.find(goal, then, qpos, executed, offset, settled)
+
+    def _lead_along(
+        self,
+        command: np.ndarray,
+        qpos: np.ndarray,
+        goals: Mapping[str, np.ndarray],
+        mode: Mode,
+        config: MpcConfig,
+        executed: np.ndarray,
+        drift: np.ndarray,
+    ) -> dict[str, np.ndarray]:
+        """Goals where a command takes the tracked frames. Shapes (H + 3, 7)."""
+        places = [
+            self.command_model.extrapolate(
+                qpos,
+                command,
+                float(ahead),
+                mode,
+                drift,
+                executed=executed,
+                offset=self.offset.offset,
+                settled=self.offset.settled,
+            )
+            for ahead in compute_times(config)
+        ]
+        sites = {name: self.sites[name] for name in goals}
+        return dict(self.readings.place(np.array(places), sites).poses)
+
     def _find_upright(self) -> tuple[str, ...]:
         """Targets that are hands to be kept level."""
         hands = {arm.frame for arm in self.morphology.arms}
@@ -334,6 +399,7 @@ class MpcRetargeter(Retargeter):
         facing: np.ndarray,
         drift: np.ndarray,
         config: MpcConfig,
+        balance: np.ndarray | None,
     ) -> Evaluation:
         """All that the cost terms are computed from."""
         references = {
@@ -381,6 +447,7 @@ class MpcRetargeter(Retargeter):
             weights=config.weights,
             upright=tuple(name for name in self._find_upright() if name in sites),
             drives=bool((decided & self.command_model.is_velocity()).any()),
+            balance=balance,
         )
 
     def _apply(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import daqp
 import mujoco
@@ -17,11 +18,26 @@ from xop_lerobot.retarget.costs.lateral import compute_lateral
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.heading import linearise_heading
 from xop_lerobot.retarget.linearisation import Linearisation, find_site
+from xop_lerobot.retarget.static_load import StaticLoad
 from xop_lerobot.transforms import quat_rotate, quat_yaw
 
 _DAMPING = 1e-3  # of the first step, in shares of a command's scale
 _CONVERGED = 1e-3  # a step that small ends the iteration, in shares of a command's scale
 _DAQP_OPTIMAL = 1
+
+
+class Solution(NamedTuple):
+    """A command, and what it costs.
+
+    Attributes:
+        command: The command. Shape (k,).
+        cost: The sum of squares.
+        missed: That of the errors, without efforts.
+    """
+
+    command: np.ndarray
+    cost: float
+    missed: float
 
 
 @dataclass(frozen=True)
@@ -31,10 +47,11 @@ class ProposalWeights:
     Attributes:
         position: Of the position error along x, y, z [1/m].
         orientation: Of the tilt about X and Y and of the heading, as in `heading_error` [1/rad].
-        effort: Of the command's distance from neutral, over its scale [1].
+        effort: Of the command's distance from the natural one, over its scale [1].
         change: Of its distance from the executed command, over its scale [1].
         support: Of the centre of mass beyond the support area [1/m].
         lean: Of the centre of mass from where it rests on the base [1/m].
+        load: Of static torques beyond their share of what a motor can [1].
         lateral: Of the heading of a base on wheels beside where it shall face [1/rad].
     """
 
@@ -45,6 +62,7 @@ class ProposalWeights:
     support: float = 30.0
     lean: float = 0.0
     lateral: float = 0.0
+    load: float = 3.0
 
 
 def make_proposal_weights(weights: CostWeights, *, upright: bool = False) -> ProposalWeights:
@@ -74,9 +92,9 @@ class KinematicProposal:
         \min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \|\rho (a - a_0)/s\|^2
         + \|\delta (a - a_{exec})/s\|^2
 
-    φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` the neutral
-    command, s half the range of each entry and ρ its effort; δ, the weight of a change, damps
-    what near a singularity would take large motions for little. A few
+    φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` a natural
+    command, neutral by default, s half the range of each entry and ρ its effort; δ, the weight of
+    a change, damps what near a singularity would take large motions for little. A few
     Levenberg-Marquardt steps within the bounds, each a small quadratic program solved by DAQP;
     the Jacobian is :math:`J_{site}(\phi)\,\partial\phi/\partial a`, by MuJoCo.
 
@@ -87,6 +105,7 @@ class KinematicProposal:
         weights: Weights of the errors.
         support: Area over which the centre of mass stays, None for a robot that balances itself.
         base_body: The robot's root body, whose centre of mass `support` is about.
+        load: What joints bear of the weight above them, None where that does not count.
         iterations: Largest number of linearisations.
     """
 
@@ -98,13 +117,14 @@ class KinematicProposal:
         weights: ProposalWeights | None = None,
         support: SupportArea | None = None,
         base_body: str = "",
+        load: StaticLoad | None = None,
         iterations: int = 6,
     ) -> None:
         self.command_model, self.sites = command_model, dict(sites)
         self.weights = weights or ProposalWeights()
         self._position = np.array(self.weights.position)
         self._orientation = np.array(self.weights.orientation)
-        self.support, self.iterations = support, iterations
+        self.support, self.load, self.iterations = support, load, iterations
         self._linearisation = Linearisation(model)
         self._site_ids = {name: find_site(model, site) for name, site in self.sites.items()}
         self._base = model.body(base_body).id if support is not None else 0
@@ -126,6 +146,8 @@ class KinematicProposal:
         settled: np.ndarray | None = None,
         facing: np.ndarray | None = None,
         free: np.ndarray | None = None,
+        natural: np.ndarray | None = None,
+        balance: np.ndarray | None = None,
     ) -> np.ndarray:
         """Compute the proposed command.
 
@@ -140,18 +162,66 @@ class KinematicProposal:
             offset: As for `CommandModel.extrapolate`. Shape (k,).
             settled: As for `CommandModel.extrapolate`. Shape (k,).
             facing: Where a base on wheels shall face, as in `Evaluation`. Shape (2,).
-            free: Which entries may move; all that act by default. Shape (k,), bool.
+            free: Which entries may move; all that act by default. The others stay at `natural`.
+                Shape (k,), bool.
+            natural: Command from which efforts count; neutral by default. Shape (k,).
+            balance: Where the centre of mass shall rest on the base, from which a lean counts;
+                where it does as the robot stands by default. Shape (2,).
 
         Returns:
             Command within the bounds. Shape (k,).
         """
+        return self.solve_from(
+            qpos,
+            goals,
+            mode,
+            dt,
+            start=start,
+            drift=drift,
+            executed=executed,
+            offset=offset,
+            settled=settled,
+            facing=facing,
+            free=free,
+            natural=natural,
+            balance=balance,
+        ).command
+
+    def solve_from(
+        self,
+        qpos: np.ndarray,
+        goals: Mapping[str, np.ndarray],
+        mode: Mode,
+        dt: float,
+        *,
+        start: np.ndarray | None = None,
+        drift: np.ndarray | None = None,
+        executed: np.ndarray | None = None,
+        offset: np.ndarray | None = None,
+        settled: np.ndarray | None = None,
+        facing: np.ndarray | None = None,
+        free: np.ndarray | None = None,
+        natural: np.ndarray | None = None,
+        balance: np.ndarray | None = None,
+        bounds: tuple[np.ndarray, np.ndarray] | None = None,
+        iterations: int | None = None,
+    ) -> Solution:
+        """Compute the proposed command, and what it costs.
+
+        Args: as for `solve`; `bounds`, shapes (k,), instead of those of the command, and
+            `iterations` instead of those of the class.
+
+        Returns:
+            Command within the bounds, and its costs; no costs without goals.
+        """
         space = self.command_model.space
         free = self.command_model.acting(mode) if free is None else free
         index = np.flatnonzero(free)
-        command = np.where(free, space.neutral if start is None else start, space.neutral)
+        natural = space.neutral if natural is None else natural
+        command = np.where(free, natural if start is None else start, natural)
         if not len(index) or not goals:
-            return command
-        low, high = space.low, space.high
+            return Solution(command, 0.0, 0.0)
+        low, high = bounds or (space.low, space.high)
         if executed is not None:  # beyond what can be reached in time nothing would change
             reach = space.compute_max_rate(mode, executed) * dt
             low, high = np.maximum(low, executed - reach), np.minimum(high, executed + reach)
@@ -163,9 +233,9 @@ class KinematicProposal:
         last = command[index] if executed is None else executed[index]
         none, sense = np.zeros((0, len(index))), np.zeros(len(index), dtype=np.int32)
 
-        best, least, damping = command, np.inf, _DAMPING
+        best, least, missed, damping = command, np.inf, np.inf, _DAMPING
         matrix = gradient = np.zeros(0)
-        for _ in range(self.iterations):
+        for _ in range(iterations or self.iterations):
             residual, jacobian = self.linearise(
                 qpos,
                 command,
@@ -177,17 +247,19 @@ class KinematicProposal:
                 offset=offset,
                 settled=settled,
                 facing=facing,
+                balance=balance,
             )
-            share = (command[index] - space.neutral[index]) / scale
+            share = (command[index] - natural[index]) / scale
             moved = change * (command[index] - last) / scale
-            cost = residual @ residual + np.square(effort * share).sum() + moved @ moved
+            squares = float(residual @ residual)
+            cost = squares + float(np.square(effort * share).sum() + moved @ moved)
             if cost < least:  # a better point: linearise there, trust the step more
-                best, least, damping = command, cost, damping / 4
+                best, least, missed, damping = command, cost, squares, damping / 4
                 scaled = jacobian[:, index] * scale
                 matrix = scaled.T @ scaled + np.diag(np.square(effort) + change**2)
                 gradient = scaled.T @ residual + np.square(effort) * share + change * moved
             elif not np.isfinite(least):
-                return command  # not a number: nothing to improve on
+                return Solution(command, cost, squares)  # not a number: nothing to improve on
             else:
                 damping *= 16
             damped = matrix + damping * np.eye(len(index))
@@ -197,7 +269,7 @@ class KinematicProposal:
                 break
             command = best.copy()
             command[index] = np.clip(best[index] + scale * step, low, high)
-        return best
+        return Solution(best, least, missed)
 
     def linearise(
         self,
@@ -212,6 +284,7 @@ class KinematicProposal:
         offset: np.ndarray | None = None,
         settled: np.ndarray | None = None,
         facing: np.ndarray | None = None,
+        balance: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the weighted errors after `dt` of a command and their derivative by it.
 
@@ -234,7 +307,11 @@ class KinematicProposal:
             residuals.append(-error * gain)
             jacobians.append(gain[:, None] * (by_rotation @ (angular @ motion)))
         if self.support is not None:
-            self._add_support(future, motion, residuals, jacobians)
+            self._add_support(future, motion, balance, residuals, jacobians)
+        if self.load is not None and self.weights.load:
+            excess, by_joints = self._linearisation.compute_load(self.load)
+            residuals.append(self.weights.load * excess)
+            jacobians.append(self.weights.load * (by_joints @ motion))
         if model.is_nonholonomic and facing is not None and weights.lateral:
             self._add_lateral(future, motion, facing, residuals, jacobians)
         return np.concatenate(residuals), np.concatenate(jacobians)
@@ -243,6 +320,7 @@ class KinematicProposal:
         self,
         future: np.ndarray,
         motion: np.ndarray,
+        balance: np.ndarray | None,
         residuals: list[np.ndarray],
         jacobians: list[np.ndarray],
     ) -> None:
@@ -257,7 +335,7 @@ class KinematicProposal:
         residuals.append(self.weights.support * excess)
         jacobians.append(self.weights.support * (by_place @ place))
         if self.weights.lean:
-            lean, by_place = self.support.linearise_lean(future[:7], com[:2])
+            lean, by_place = self.support.linearise_lean(future[:7], com[:2], balance)
             residuals.append(self.weights.lean * lean)
             jacobians.append(self.weights.lean * (by_place @ place))
 

@@ -141,6 +141,7 @@ class RoutePlanner:
         duration: float,
         turn_rate: float = 0.0,
         room: float = math.inf,
+        ahead: float | None = None,
     ) -> Route:
         """Simulate the way.
 
@@ -154,6 +155,7 @@ class RoutePlanner:
             turn_rate: Yaw rate of the goal; behind one that turns the base does not wait until
                 the waist is at its limit [rad/s].
             room: How far the arms let the waist twist [rad].
+            ahead: How far ahead of the base it will be, where not as at rest [m].
         """
         heading = float(quat_yaw(qpos[3:7]))
         x = float(qpos[0]) + self._pivot * math.cos(heading)
@@ -163,7 +165,8 @@ class RoutePlanner:
             carried = _rotate(float(pose[0]) - x, float(pose[1]) - y, -heading)
             aim = _Aim(gx, gy, heading, 0.0, carried)
         else:
-            carried = (self._resting[name] - self._pivot, 0.0)
+            resting = self._resting[name] if ahead is None else ahead
+            carried = (resting - self._pivot, 0.0)
             turning = min(max((abs(turn_rate) - _RESTING) / (_TURNING - _RESTING), 0.0), 1.0)
             twist = min(_MAX_TWIST + turning * (_TURNING_TWIST - _MAX_TWIST), room)
             aim = _Aim(gx, gy, float(compute_heading(goal[3:])), twist, carried)

@@ -8,7 +8,7 @@ import numpy as np
 
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.g1.links import LINKS
-from xop_lerobot.morphology.g1.mpc import EFFECTS, mpc_config
+from xop_lerobot.morphology.g1.mpc import EFFECTS, STANDING_REACH, mpc_config
 from xop_lerobot.morphology.g1.shapes import FOOT_POINTS
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
 
@@ -114,6 +114,7 @@ class G1(Morphology):
     fall_height = 0.35
     fall_tilt = 0.8
     wheeled = False
+    standing_reach = STANDING_REACH
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
         """Build G1 alone."""

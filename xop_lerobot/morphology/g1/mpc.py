@@ -20,6 +20,9 @@ EFFECTS = (
     Effect(Acts.TURN),
 )
 
+STANDING_REACH = 0.15
+"""How far a standing robot's head is led from where it rests [m]: what sway and waist serve."""
+
 CONFIGS = {
     Mode.STATIONARY: MpcConfig(
         num_samples=16,

@@ -16,7 +16,16 @@ from xop_lerobot.morphology.morphology import (
     Variant,
 )
 from xop_lerobot.morphology.rby1.links import LINKS
-from xop_lerobot.morphology.rby1.mpc import EFFECTS, HULL, PIVOT, SUPPORT, V2_CONFIG, mpc_config
+from xop_lerobot.morphology.rby1.mpc import (
+    EFFECTS,
+    HULL,
+    PIVOT,
+    POSTURE_LIMITS,
+    STANDING_REACH,
+    SUPPORT,
+    V2_CONFIG,
+    mpc_config,
+)
 from xop_lerobot.retarget.config import PaperParameters
 
 if TYPE_CHECKING:
@@ -121,6 +130,8 @@ class RBY1(Morphology):
     has_stiff_body = True
     # Moving, its servos are behind by 0.03 rad at most; a torso that folds leaves 0.3 to 1.5.
     servo_gap = 0.1
+    posture_limits = POSTURE_LIMITS
+    standing_reach = STANDING_REACH
     hull_points = HULL
     hull_hands = ("left_palm", "right_palm")
     fall_height = -0.2

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from xop_lerobot.command import Mode
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.retarget.config import CostWeights, MpcConfig
@@ -34,6 +36,13 @@ EFFECTS = (
         for i, effort in enumerate((10.0, 4.0, 4.0, 4.0, 10.0, 1.0))
     ),
 )
+
+POSTURE_LIMITS = {"torso_2": (-math.inf, 0.0)}
+"""Its knees bend to the front. Bent to the back they take it to places that servos do not hold:
+the chest hangs far ahead, and folds."""
+
+STANDING_REACH = 0.3
+"""How far a standing robot's head is led from where it rests [m]; the torque may allow less."""
 
 TORSO_NOISE = {f"torso_{i}": 0.05 for i in range(6)}
 

@@ -39,6 +39,8 @@ class Evaluation:
         dt: Time between steps [s].
         weights: The weights.
         upright: Tracked frames whose hand is to stay level.
+        balance: Where the centre of mass shall rest on the base, of robots with a support area;
+            None: where it does as the robot stands. Shape (2,).
         drives: Whether anything that is decided moves the base over the ground.
     """
 
@@ -63,6 +65,7 @@ class Evaluation:
     weights: CostWeights
     upright: tuple[str, ...] = ()
     drives: bool = True
+    balance: np.ndarray | None = None
 
 
 class Cost(ABC):

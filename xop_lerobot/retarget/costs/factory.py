@@ -15,6 +15,7 @@ from xop_lerobot.retarget.costs.support import SupportArea, SupportCost
 from xop_lerobot.retarget.costs.terminal import TerminalCost
 from xop_lerobot.retarget.costs.tracking import TrackingCost
 from xop_lerobot.retarget.costs.upright import UprightCost
+from xop_lerobot.retarget.static_load import StaticLoad
 
 
 def make_costs(
@@ -23,6 +24,7 @@ def make_costs(
     support: SupportArea | None,
     collision: CollisionCost,
     fall: FallCost,
+    load: StaticLoad | None = None,
 ) -> tuple[Cost, ...]:
     """Make all terms; those that a robot has no use for cost nothing."""
     space = command_model.space
@@ -34,7 +36,7 @@ def make_costs(
         ControlCost((space.high - space.low) / 2),
         ChangeCost((space.high - space.low) / 2),
         UprightCost(),
-        SupportCost(support),
+        SupportCost(support, load),
         LateralCost(command_model.is_nonholonomic),
         fall,
     )

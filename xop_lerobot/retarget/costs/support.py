@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.retarget.static_load import StaticLoad
 from xop_lerobot.transforms import quat_yaw, sum_squares
 
 GRAVITY = 9.81
@@ -44,12 +45,16 @@ class SupportArea:
         """`compute_excess` of places in the base's frame [m]. (..., 2) -> (..., c)."""
         return np.maximum(places @ self._normals.T - self._offsets, 0)
 
-    def compute_lean(self, base: np.ndarray, com: np.ndarray) -> np.ndarray:
+    def compute_lean(
+        self, base: np.ndarray, com: np.ndarray, balance: np.ndarray | None = None
+    ) -> np.ndarray:
         """Place of the centre of mass beyond the free circle about where it rests [m].
+
+        That is `balance`, shape (2,), or where it rests as the robot stands.
 
         Shapes (..., 7), (..., 2) -> (..., 2).
         """
-        offset = _to_base(base, com) - self._resting
+        offset = _to_base(base, com) - (self._resting if balance is None else balance)
         length = np.sqrt(sum_squares(offset))
         share = np.maximum(0, 1 - self._free / np.maximum(length, 1e-9))
         return offset * share[..., None]
@@ -65,12 +70,14 @@ class SupportArea:
         outside = excess > 0
         return np.where(outside, excess, 0.0), self._normals * outside[:, None]
 
-    def linearise_lean(self, base: np.ndarray, com: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearise_lean(
+        self, base: np.ndarray, com: np.ndarray, balance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """`compute_lean` of one place, and its derivative by the place in the base's frame.
 
         Shapes (7,), (2,) -> (2,), (2, 2).
         """
-        offset = _to_base(base, com) - self._resting
+        offset = _to_base(base, com) - (self._resting if balance is None else balance)
         length = float(np.linalg.norm(offset))
         if length <= self._free:
             return np.zeros(2), np.zeros((2, 2))
@@ -103,22 +110,28 @@ class SupportCost(Cost):
     come to rest over a pivot if all joints stopped (the capture point; Pratt et al., 2006).
     The third is the centre of mass itself at the end of the extrapolation, where the robot shall
     be able to stand still. There its squared distance beyond a free circle about where it rests
-    counts too, with the weight `lean`: a mobile robot shall drive after its goal, not bend.
-    The paper has no such term.
+    counts too, with the weight `lean`: a mobile robot shall drive after its goal, not bend; and
+    the static torques there beyond their share of what motors can, squared, with the weight
+    `load`: a torso whose servos give way folds. The paper has no such term.
 
     Args:
         area: The support area, None for a robot whose policy keeps the balance.
+        load: What joints bear of the weight above them; None where that does not count.
     """
 
     name = "support"
 
-    def __init__(self, area: SupportArea | None) -> None:
-        self.area = area
+    def __init__(self, area: SupportArea | None, load: StaticLoad | None = None) -> None:
+        self.area, self.load = area, load
 
     def compute(self, evaluation: Evaluation) -> np.ndarray:
         """Cost of every sample. Shape (K,)."""
+        loaded = np.zeros(len(evaluation.qpos))
+        if self.load is not None:
+            beyond = self.load.compute_excess(evaluation.terminal_qpos)
+            loaded = evaluation.weights.load * sum_squares(beyond)
         if self.area is None:
-            return np.zeros(len(evaluation.qpos))
+            return loaded
         com, dt = evaluation.com[:, 1:], evaluation.dt
         velocity = np.diff(com[..., :2], axis=1) / dt
         acceleration = np.zeros((len(com), 2))  # two steps or less do not tell
@@ -130,8 +143,8 @@ class SupportCost(Cost):
         excess = excess.mean(-1) + sum_squares(self._compute_capture_excess(evaluation))
         base, com = evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
         excess += sum_squares(self.area.compute_excess(base, com))
-        lean = sum_squares(self.area.compute_lean(base, com))
-        return evaluation.weights.support * excess + evaluation.weights.lean * lean
+        lean = sum_squares(self.area.compute_lean(base, com, evaluation.balance))
+        return evaluation.weights.support * excess + evaluation.weights.lean * lean + loaded
 
     def _compute_capture_excess(self, evaluation: Evaluation) -> np.ndarray:
         """Distances of the capture point beyond each edge at the end of the horizon. (K, c)."""

@@ -1,0 +1,322 @@
+"""Holds the head's goal within what the robot can serve, and knows the posture for it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
+from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.retarget.costs.support import SupportArea
+from xop_lerobot.retarget.linearisation import Placement
+from xop_lerobot.retarget.posture import AT_REST_S, Found, PostureSearch, Repertoire
+from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
+from xop_lerobot.retarget.static_load import StaticLoad
+from xop_lerobot.state import Goal
+from xop_lerobot.transforms import (
+    compute_heading,
+    heading_error,
+    make_pose,
+    quat_conjugate,
+    quat_exp,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    quat_yaw,
+)
+
+HEAD = "head"
+_EFFORT, _LEVEL_EFFORT = 0.002, 0.01  # of a posture, which has all the time to get there
+_NEAR, _SAME = 0.01, 0.03  # by which a goal may be missed before it is moved [m], [rad]
+_STOPPING = 0.2  # speed from which on a robot does not lean after what it cannot follow [m/s]
+_BEYOND = 0.6  # turn past half a turn at which the other way round is taken [rad]
+
+
+class Served(NamedTuple):
+    """How a robot would be at the head's goal.
+
+    Attributes:
+        natural: The command that holds the posture. Shape (n,).
+        balance: Where its centre of mass is on the base; None for a robot without support area.
+            Shape (2,).
+        ahead: How far ahead of the base the head is then [m].
+        shift: What the posture misses of the goal, world axes [m]. Shape (3,).
+        turn: The same of its orientation: a tilt about X and Y, then a turn [rad]. Shape (3,).
+        detour: Whether the robot has to go another way than nearer and nearer.
+    """
+
+    natural: np.ndarray
+    balance: np.ndarray | None
+    ahead: float
+    shift: np.ndarray
+    turn: np.ndarray
+    detour: bool
+
+    def move(self, track: np.ndarray) -> np.ndarray:
+        """Move goals to where they can be served. (n, 7) -> (n, 7)."""
+        if not self.shift.any() and not self.turn.any():
+            return track
+        tilt = quat_exp(np.array([self.turn[0], self.turn[1], 0.0]))
+        turn = quat_multiply(quat_from_yaw(float(self.turn[2])), tilt)
+        return make_pose(track[:, :3] + self.shift, quat_multiply(turn, track[:, 3:]))
+
+
+class PostureGuide:
+    """Tells in which posture the robot would be at the head's goal, and how much it misses.
+
+    In stationary mode that is a posture for the whole pose, on the feet or the base that stand.
+    First the goal is held near the place where the head rests, and its heading within what the
+    waist turns: what is further off cannot be served, and would only contort the robot. While it
+    still brakes the head is held where it rests. A robot
+    that drives is in the right posture when height and nod are right: the rest is the wheels'.
+    A walking robot, which takes no posture, gets none.
+
+    Args:
+        morphology: The robot.
+        model: Its planning model.
+        command_model: What a decision does.
+        support: Area over which the centre of mass stays; None for a robot that balances itself.
+    """
+
+    def __init__(
+        self,
+        morphology: Morphology,
+        model: mujoco.MjModel,
+        command_model: CommandModel,
+        support: SupportArea | None,
+    ) -> None:
+        self._morphology, self._model, self._command_model = morphology, model, command_model
+        self._support = support
+        self.load = make_static_load(morphology, model)
+        self._site = morphology.frames[HEAD]
+        base = morphology.base_body
+        self._placement = Placement(model, (self._site,), com_of=base)
+        standing = morphology.standing_qpos()
+        self._repertoire = Repertoire(
+            model, command_model, standing, self._site, base, support, self.load
+        )
+        roll, _, self._vertical = (
+            find_joints_along(morphology, model, command_model, axis) for axis in range(3)
+        )
+        self._aside = roll | self._vertical
+        self._resting = self._place(standing, command_model.space.neutral)[0][:2]
+        space = command_model.space
+        low, high = space.low.copy(), space.high.copy()
+        for name, (least, most) in morphology.posture_limits.items():
+            i = space.index(name)
+            low[i], high[i] = max(low[i], least), min(high[i], most)
+        self._limits = (low, high)
+        self._searches: dict[Mode, PostureSearch] = {}
+        self._level: PostureSearch | None = None
+        self.reset()
+
+    def configure(self, configs: Mapping[Mode, MpcConfig], sites: Mapping[str, str]) -> None:
+        """Take other parameters or targets; there are postures for a head alone."""
+        self._searches, self._level = {}, None
+        self._beside = 0.0
+        if HEAD not in sites:
+            return
+        still = configs[Mode.STATIONARY]
+        self._searches[Mode.STATIONARY] = self._make_search(still, level=False)
+        self._level = self._make_search(still, level=True)
+        if self._command_model.is_nonholonomic:
+            self._searches[Mode.MOBILE] = self._make_search(
+                configs[Mode.MOBILE], level=True, upright=True
+            )
+
+    def _make_search(
+        self, config: MpcConfig, *, level: bool, upright: bool = False
+    ) -> PostureSearch:
+        """Make a search: for height and tilt alone where it is `level`; without a lean aside."""
+        weights = make_proposal_weights(config.weights)
+        used = np.ones(len(self._vertical), dtype=bool)
+        weights = dataclasses.replace(weights, effort=_EFFORT, change=0.0, lean=0.0)
+        if level:
+            tilt = weights.orientation[0]
+            weights = dataclasses.replace(
+                weights,
+                position=(0.0, 0.0, weights.position[2]),
+                orientation=(tilt, tilt, 0.0),
+                effort=_LEVEL_EFFORT,
+            )
+            used &= ~(self._aside if upright else self._vertical)
+        problem = KinematicProposal(
+            self._model,
+            self._command_model,
+            {HEAD: self._site},
+            weights,
+            self._support,
+            self._morphology.base_body,
+            self.load,
+        )
+        return PostureSearch(problem, self._repertoire, used, self._limits, strict=level)
+
+    def reset(self) -> None:
+        """Start anew."""
+        for search in (*self._searches.values(), self._level):
+            if search is not None:
+                search.reset()
+        self._beside = 0.0
+
+    def hold(
+        self,
+        goal: Goal,
+        qpos: np.ndarray,
+        executed: np.ndarray,
+        offset: np.ndarray,
+        settled: np.ndarray,
+    ) -> Goal:
+        """Hold the goal of a robot that stands near the place where its head rests.
+
+        Args:
+            goal: The goal.
+            qpos: Configuration now. Shape (nq,).
+            executed: Decision executed now. Shape (n,).
+            offset: As for `CommandModel.extrapolate`. Shape (n,).
+            settled: As for `CommandModel.extrapolate`. Shape (n,).
+        """
+        if self._level is None or goal.mode is not Mode.STATIONARY or HEAD not in goal.poses:
+            return goal
+        pose = goal.poses[HEAD].copy()
+        heading = float(quat_yaw(qpos[3:7]))
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        axes = np.stack([ahead, [-ahead[1], ahead[0]]])
+        place = axes @ (pose[:2] - qpos[:2])
+        velocities = dict(goal.velocities)
+        moving = self._compute_motion(executed)
+        speed = float(np.hypot(*moving))
+        reach = self._morphology.standing_reach * max(0.0, 1 - speed / _STOPPING)
+        if speed > 0:  # a base that still brakes takes the head with it: a lean would add to that
+            velocities[HEAD] = np.array([*(moving @ axes), 0.0, 0.0, 0.0, 0.0])
+        if math.dist(place, self._resting) > reach:
+            # Who bows or squats has the head elsewhere; up to there it is no matter of reach.
+            found = self._level.find(HEAD, qpos, pose, executed, offset, settled)
+            bowed, _ = self._place(qpos, found.command, offset, settled)
+            bowed = axes @ (bowed[:2] - qpos[:2])
+            place = _hold_near_line(place, self._resting, bowed, reach)
+            pose[:2] = qpos[:2] + place @ axes
+        pose[3:] = self._hold_heading(pose[3:], heading)
+        poses = {**goal.poses, HEAD: pose}
+        return dataclasses.replace(goal, poses=poses, velocities=velocities)
+
+    def _compute_motion(self, executed: np.ndarray) -> np.ndarray:
+        """Velocity along and across that is more than a robot that stands may have. Shape (2,)."""
+        sway = self._command_model.compute_twist(self._command_model.space.sway)[:2]
+        twist = self._command_model.compute_twist(executed)[:2]
+        return np.sign(twist) * np.maximum(np.abs(twist) - sway, 0.0)
+
+    def _hold_heading(self, quat: np.ndarray, base: float) -> np.ndarray:
+        """Turn a goal back to where the waist can look, on the side where it was. (4,)."""
+        beside = float(compute_heading(quat)) - base
+        beside = self._beside + math.remainder(beside - self._beside, math.tau)
+        if abs(beside) > math.pi + _BEYOND:
+            beside = math.remainder(beside, math.tau)
+        self._beside = beside
+        space = self._command_model.space
+        waist = self._vertical & self._command_model.acting(Mode.STATIONARY)
+        held = min(max(beside, space.low[waist].sum()), space.high[waist].sum())
+        if held == beside:
+            return quat
+        return quat_multiply(quat_from_yaw(held - beside), quat)
+
+    def find(
+        self,
+        goal: Goal,
+        pose: np.ndarray,
+        qpos: np.ndarray,
+        executed: np.ndarray,
+        offset: np.ndarray,
+        settled: np.ndarray,
+    ) -> Served | None:
+        """Find the posture for the head at `pose`; None where the mode knows none.
+
+        Args: as for `hold`; `pose` is the goal of the head that counts. Shape (7,).
+        """
+        search = self._searches.get(goal.mode)
+        if search is None:
+            return None
+        if goal.mode is Mode.MOBILE:
+            pose = _remove_roll(pose)
+        found = search.find(HEAD, qpos, pose, executed, offset, settled)
+        if not np.isfinite(found.command).all():
+            search.reset()
+            return None
+        return self._describe(found, goal.mode, pose, qpos, offset, settled)
+
+    def _describe(
+        self,
+        found: Found,
+        mode: Mode,
+        pose: np.ndarray,
+        qpos: np.ndarray,
+        offset: np.ndarray,
+        settled: np.ndarray,
+    ) -> Served:
+        there, com = self._place(qpos, found.command, offset, settled)
+        heading = float(quat_yaw(qpos[3:7]))
+        cosine, sine = math.cos(heading), math.sin(heading)
+        to_base = np.array([[cosine, sine], [-sine, cosine]])
+        shift, turn = there[:3] - pose[:3], heading_error(there[3:], pose[3:])
+        if mode is Mode.MOBILE:  # the rest is not the posture's
+            shift[:2], turn[2] = 0.0, 0.0
+        return Served(
+            natural=found.command,
+            balance=to_base @ (com[:2] - qpos[:2]) if self._support is not None else None,
+            ahead=float(to_base[0] @ (there[:2] - qpos[:2])),
+            shift=_forgive(shift, _NEAR),
+            turn=_forgive(turn, _SAME),
+            detour=found.detour,
+        )
+
+    def _place(
+        self,
+        qpos: np.ndarray,
+        command: np.ndarray,
+        offset: np.ndarray | None = None,
+        settled: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pose of the head (7,) and centre of mass (3,) of a robot at rest under a command."""
+        future = self._command_model.extrapolate(
+            qpos, command, AT_REST_S, Mode.STATIONARY, offset=offset, settled=settled
+        )
+        poses, _, com = self._placement.compute(future[None])
+        return poses[self._site][0], com[0]
+
+
+def make_static_load(morphology: Morphology, model: mujoco.MjModel) -> StaticLoad | None:
+    """What the servos of a stiff body bear; None where a policy moves the body."""
+    if not morphology.has_stiff_body:
+        return None
+    joints = [effect.joint for effect in morphology.effects if effect.joint]
+    return StaticLoad(model, joints, morphology.load_share)
+
+
+def _remove_roll(pose: np.ndarray) -> np.ndarray:
+    """A pose with its heading and its nod alone. Shape (7,)."""
+    heading = quat_from_yaw(float(compute_heading(pose[3:])))
+    x, _, z = quat_rotate(quat_multiply(quat_conjugate(heading), pose[3:]), np.eye(3)[0])
+    nod = quat_exp(np.array([0.0, math.atan2(-z, x), 0.0]))
+    return make_pose(pose[:3], quat_multiply(heading, nod))
+
+
+def _forgive(error: np.ndarray, tolerance: float) -> np.ndarray:
+    """What of an error is beyond a tolerance. Shape (3,)."""
+    return error * max(0.0, 1 - tolerance / max(float(np.linalg.norm(error)), 1e-12))
+
+
+def _hold_near_line(
+    point: np.ndarray, start: np.ndarray, end: np.ndarray, reach: float
+) -> np.ndarray:
+    """Move a point to within `reach` of the line from `start` to `end`. Shapes (2,)."""
+    along = end - start
+    share = float(along @ (point - start)) / max(float(along @ along), 1e-12)
+    foot = start + min(max(share, 0.0), 1.0) * along
+    offset = point - foot
+    return foot + offset * min(1.0, reach / max(float(np.linalg.norm(offset)), 1e-12))
