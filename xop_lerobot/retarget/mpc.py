@@ -245,7 +245,7 @@ class MpcRetargeter(Retargeter):
             state.qpos, executed, poses, goal, config, state.time, served
         )
         if served is not None:
-            goals[HEAD] = served.move(goals[HEAD])
+            goals = {**goals, HEAD: served.move(goals[HEAD])}
         then = {name: track[-1:] for name, track in goals.items()}
         proposal = self.candidates.propose(
             state,
@@ -260,10 +260,11 @@ class MpcRetargeter(Retargeter):
         )
         proposal = np.where(acting, proposal, held)
         if served is not None and served.detour:
-            goals = self._lead_along(proposal, state.qpos, goals, mode, config, executed, drift)
+            moving = Mode.MOBILE if served.brakes else mode  # a base that brakes still moves
+            goals = self._lead_along(proposal, state.qpos, goals, moving, config, executed, drift)
         candidates = self.candidates.collect(state, goal, executed, proposal, config)
         candidates = np.where(acting, candidates, held)
-        noise = self._noise[mode] * acting * _compute_noise_share(poses, goals, config)
+        noise = self._noise[mode] * acting * _compute_noise_share(poses, goals, config, served)
         samples = planner.sample(self._rng, noise, candidates)
         commands = self.space.restrict(np.where(acting, samples.commands, held), mode)
         sampled = perf_counter()
@@ -472,15 +473,23 @@ def _finite(value: float) -> float:
 
 
 def _compute_noise_share(
-    poses: Mapping[str, np.ndarray], goals: Mapping[str, np.ndarray], config: MpcConfig
+    poses: Mapping[str, np.ndarray],
+    goals: Mapping[str, np.ndarray],
+    config: MpcConfig,
+    served: Served | None,
 ) -> float:
     """Share of the full noise: little at the goal, where fine commands are what counts.
+
+    None for a robot that brakes: it does nothing but stop, in the posture it has.
 
     Args:
         poses: Tracked frames now. Shapes (7,).
         goals: Their goals at `compute_times`. Shapes (H + 3, 7).
         config: Parameters of the mode.
+        served: The posture for the head's goal, None where there is none.
     """
+    if served is not None and served.brakes:
+        return 0.0
     error = 0.0
     for name, track in goals.items():
         pose, goal = poses[name], track[config.horizon]

@@ -35,7 +35,7 @@ from xop_lerobot.transforms import (
 HEAD = "head"
 _EFFORT, _LEVEL_EFFORT = 0.002, 0.01  # of a posture, which has all the time to get there
 _NEAR, _SAME = 0.01, 0.03  # by which a goal may be missed before it is moved [m], [rad]
-_STOPPING = 0.2  # speed from which on a robot does not lean after what it cannot follow [m/s]
+_CREEP = 0.02  # speed that counts as none [m/s], [rad/s]
 _BEYOND = 0.6  # turn past half a turn at which the other way round is taken [rad]
 
 
@@ -50,6 +50,7 @@ class Served(NamedTuple):
         shift: What the posture misses of the goal, world axes [m]. Shape (3,).
         turn: The same of its orientation: a tilt about X and Y, then a turn [rad]. Shape (3,).
         detour: Whether the robot has to go another way than nearer and nearer.
+        brakes: Whether that is to stop first, in the posture it has.
     """
 
     natural: np.ndarray
@@ -58,6 +59,7 @@ class Served(NamedTuple):
     shift: np.ndarray
     turn: np.ndarray
     detour: bool
+    brakes: bool = False
 
     def move(self, track: np.ndarray) -> np.ndarray:
         """Move goals to where they can be served. (n, 7) -> (n, 7)."""
@@ -73,8 +75,9 @@ class PostureGuide:
 
     In stationary mode that is a posture for the whole pose, on the feet or the base that stand.
     First the goal is held near the place where the head rests, and its heading within what the
-    waist turns: what is further off cannot be served, and would only contort the robot. While it
-    still brakes the head is held where it rests. A robot
+    waist turns: what is further off cannot be served, and would only contort the robot. What
+    still brakes after a change of mode keeps its posture until it stands: a torso that leans after
+    its goal, or back, meanwhile needs more torque than it has. A robot
     that drives is in the right posture when height and nod are right: the rest is the wheels'.
     A walking robot, which takes no posture, gets none.
 
@@ -189,12 +192,7 @@ class PostureGuide:
         ahead = np.array([math.cos(heading), math.sin(heading)])
         axes = np.stack([ahead, [-ahead[1], ahead[0]]])
         place = axes @ (pose[:2] - qpos[:2])
-        velocities = dict(goal.velocities)
-        moving = self._compute_motion(executed)
-        speed = float(np.hypot(*moving))
-        reach = self._morphology.standing_reach * max(0.0, 1 - speed / _STOPPING)
-        if speed > 0:  # a base that still brakes takes the head with it: a lean would add to that
-            velocities[HEAD] = np.array([*(moving @ axes), 0.0, 0.0, 0.0, 0.0])
+        reach = self._morphology.standing_reach
         if math.dist(place, self._resting) > reach:
             # Who bows or squats has the head elsewhere; up to there it is no matter of reach.
             found = self._level.find(HEAD, qpos, pose, executed, offset, settled)
@@ -204,13 +202,13 @@ class PostureGuide:
             pose[:2] = qpos[:2] + place @ axes
         pose[3:] = self._hold_heading(pose[3:], heading)
         poses = {**goal.poses, HEAD: pose}
-        return dataclasses.replace(goal, poses=poses, velocities=velocities)
+        return dataclasses.replace(goal, poses=poses)
 
-    def _compute_motion(self, executed: np.ndarray) -> np.ndarray:
-        """Velocity along and across that is more than a robot that stands may have. Shape (2,)."""
-        sway = self._command_model.compute_twist(self._command_model.space.sway)[:2]
-        twist = self._command_model.compute_twist(executed)[:2]
-        return np.sign(twist) * np.maximum(np.abs(twist) - sway, 0.0)
+    def _is_braking(self, executed: np.ndarray) -> bool:
+        """Whether more is executed than what sways a robot that stands."""
+        sway = self._command_model.compute_twist(self._command_model.space.sway)
+        twist = self._command_model.compute_twist(executed)
+        return bool((np.abs(twist) > sway + _CREEP).any())
 
     def _hold_heading(self, quat: np.ndarray, base: float) -> np.ndarray:
         """Turn a goal back to where the waist can look, on the side where it was. (4,)."""
@@ -242,6 +240,12 @@ class PostureGuide:
         search = self._searches.get(goal.mode)
         if search is None:
             return None
+        if goal.mode is Mode.STATIONARY and self._is_braking(executed):
+            stop = np.where(self._command_model.is_velocity(), 0.0, executed)
+            still = Found(stop, 0.0, detour=True)
+            there, _ = self._place(qpos, stop, offset, settled)
+            served = self._describe(still, goal.mode, there, qpos, offset, settled)
+            return served._replace(brakes=True)
         if goal.mode is Mode.MOBILE:
             pose = _remove_roll(pose)
         found = search.find(HEAD, qpos, pose, executed, offset, settled)
