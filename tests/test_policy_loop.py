@@ -547,3 +547,24 @@ def test_targets_come_in_a_straight_line_where_the_controller_ramps(robot, ramps
         np.testing.assert_allclose(moved, 0.01 * np.arange(1, 9), atol=1e-6)
     else:
         assert len(set(moved[:4])) == 1
+
+
+def test_a_policy_keeps_the_arms_where_it_stands() -> None:
+    """Robot and teleoperator limit alike, at the arms' rate, and only what the policy names."""
+    morphology = make_morphology("g1")
+    limits = make_policy("default").arm_limits
+    assert set(limits) == {f"{side}_shoulder_pitch_joint" for side in ("left", "right")}
+    rest = morphology.rest_action()
+    action = RobotAction(rest.command, Mode.STATIONARY, np.full(14, 2.0))
+    limited = limit_action(morphology, action, rest, 1.0, limits)
+    kept = [morphology.arm_names.index(joint) for joint in limits]
+    np.testing.assert_allclose(limited.arms[kept], 1.5)
+    np.testing.assert_allclose(np.delete(limited.arms, kept), 2.0)
+    again = limit_action(morphology, limited, limited, 0.04, limits)
+    np.testing.assert_array_equal(again.arms, limited.arms)
+    plant = Simulation(morphology, kind="planning")
+    loop = PolicyLoop(morphology, plant, make_policy("default"))
+    for _ in range(40):
+        loop.execute(action, 0.04)
+    np.testing.assert_allclose(loop.action.arms[kept], 1.5)
+    loop.close()

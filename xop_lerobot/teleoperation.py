@@ -119,7 +119,12 @@ class Teleoperation:
         )
         self._sync = StateSync(self.morphology, model) if config.retargeter.sync else None
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
-        self._arms = ArmDriver(self.morphology, holds_place=self.retargeter.holds_place)
+        self._arm_limits = policy.arm_limits
+        self._arms = ArmDriver(
+            self.morphology,
+            holds_place=self.retargeter.holds_place,
+            arm_limits=policy.arm_limits,
+        )
         self._smoother = CommandSmoother(self.morphology.command_space, self.dt)
         self._start_over()
 
@@ -451,7 +456,7 @@ class Teleoperation:
         )
         previous = RobotAction(state.command, state.mode, state.arms)
         smooth = RobotAction(command, mode, wanted.arms)
-        action = limit_action(self.morphology, smooth, previous, self.dt)
+        action = limit_action(self.morphology, smooth, previous, self.dt, self._arm_limits)
         self._smoother.note(state.command, action.command)
         self._arms.note(action.arms)
         return action

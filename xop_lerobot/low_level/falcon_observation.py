@@ -235,6 +235,8 @@ class FalconLikePolicy(LowLevelPolicy):
     """A network with FALCON's inputs, outputs and memory: last action, then five frames."""
 
     memory_size = MEMORY_SIZE
+    # With arms swung back beyond this, farther than people can, it walks off by metres.
+    arm_limits = {f"{side}_shoulder_pitch_joint": (-3.0892, 1.5) for side in ("left", "right")}
 
     @abstractmethod
     def infer(self, observation: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -41,6 +41,9 @@ class LowLevelPolicy(ABC):
 
     name: str
     memory_size: int
+    arm_limits: Mapping[str, tuple[float, float]] = {}
+    """Angles within which arm targets are kept, by joint, where the robot does not stand or walk
+    safely beyond [rad]; `scripts/map_arm_postures.py` tells."""
 
     def adapt(self, model: mujoco.MjModel) -> None:
         """Give `model`, of a plant or of rollouts, the motors that the policy was trained with.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 
@@ -94,12 +96,16 @@ class PolicyLoop:
             BadValue: If `dt` is not a whole multiple of the policy's period.
         """
         self._previous = self.action
-        self.action = limit_action(self.morphology, action, self.action, dt)
+        self.action = self.limit(action, dt)
         try:
             self.advance(dt)
         finally:
             self._previous = None
         return self.action
+
+    def limit(self, action: RobotAction, dt: float) -> RobotAction:
+        """What of `action` is executed within `dt` [s], after what is being executed now."""
+        return limit_action(self.morphology, action, self.action, dt, self.policy.arm_limits)
 
     def advance(self, dt: float) -> None:
         """Let `dt` [s] pass under the present action.
@@ -158,13 +164,24 @@ ARM_MAX_SPEED = 6.0
 
 
 def limit_action(
-    morphology: Morphology, action: RobotAction, previous: RobotAction, dt: float
+    morphology: Morphology,
+    action: RobotAction,
+    previous: RobotAction,
+    dt: float,
+    arm_limits: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> RobotAction:
     """What of `action` a robot executes after `previous` within `dt` [s].
 
     Teleoperator and robot both call it, so that the recorded action is the executed one:
     limiting twice is limiting once. Datasets hold single precision, so actions are rounded to
     it, and a replayed action is the recorded one to the last bit.
+
+    Args:
+        morphology: The robot.
+        action: What is wanted.
+        previous: What was executed last.
+        dt: Time since then [s].
+        arm_limits: Angles that the robot's low-level policy keeps arm joints within [rad].
 
     Raises:
         BadShape: If the command or the arms have the wrong size.
@@ -173,6 +190,9 @@ def limit_action(
     command = morphology.command_space.limit(action.command, previous.command, dt, action.mode)
     num_joints = sum(len(arm.joints) for arm in morphology.arms)
     arms = check_vector("arms", action.arms, len(morphology.arm_names)).copy()
+    for joint, (low, high) in arm_limits.items():
+        place = morphology.arm_names.index(joint)
+        arms[place] = min(max(arms[place], low), high)
     reach = ARM_MAX_SPEED * dt
     arms[:num_joints] = np.clip(
         arms[:num_joints], previous.arms[:num_joints] - reach, previous.arms[:num_joints] + reach

@@ -13,7 +13,7 @@ from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.plant.plant import Plant
-from xop_lerobot.plant.policy_loop import PolicyLoop, limit_action
+from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.state import RobotState
 
 logger = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ class RealtimeLoop:
         """
         with self._lock:
             self._check()
-            limited = limit_action(self.morphology, action, self._loop.action, dt)
+            limited = self._loop.limit(action, dt)
             self._loop.action = limited
             self._handed_over, self._resting = time.monotonic(), None
         return limited
@@ -137,7 +137,7 @@ class RealtimeLoop:
         if self._resting is None:
             self._resting = space.compute_rest(action.command, action.mode)
         wanted = dataclasses.replace(action, command=self._resting)
-        action = limit_action(self.morphology, wanted, action, POLICY_DT)
+        action = self._loop.limit(wanted, POLICY_DT)
         moves = space.mobile_only & (np.abs(action.command - self._resting) > 1e-6)
         if not moves.any():
             action = dataclasses.replace(action, mode=Mode.STATIONARY)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -38,12 +39,19 @@ class ArmDriver:
     Args:
         morphology: The robot.
         holds_place: Whether the body is brought to where its goal is (`Retargeter.holds_place`).
+        arm_limits: Angles that the robot's low-level policy keeps arm joints within [rad].
     """
 
-    def __init__(self, morphology: Morphology, *, holds_place: bool = True) -> None:
+    def __init__(
+        self,
+        morphology: Morphology,
+        *,
+        holds_place: bool = True,
+        arm_limits: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    ) -> None:
         self.morphology = morphology
         self.holds_place = holds_place
-        self.ik = ArmIk(morphology)
+        self.ik = ArmIk(morphology, arm_limits=arm_limits)
         self.bias = ArmBias(self.ik.joint_range, time_constant=BIAS_TIME)
         self._body = SteadyBody(morphology, self.ik.model)
         self.load = ArmLoad(morphology)

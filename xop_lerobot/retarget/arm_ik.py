@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import mink
 import mujoco
@@ -31,6 +32,7 @@ class ArmIk:
         morphology: The robot.
         max_speed: Speed limit of the arm joints [rad/s].
         iterations: Steps per solve.
+        arm_limits: Angles to keep joints within besides the morphology's [rad].
     """
 
     def __init__(
@@ -38,6 +40,7 @@ class ArmIk:
         morphology: Morphology,
         max_speed: float = ARM_MAX_RATE,
         iterations: int = 2,
+        arm_limits: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     ) -> None:
         self.iterations = iterations
         self.model = model = morphology.build_spec("full").compile()
@@ -47,8 +50,9 @@ class ArmIk:
         """Where the arm joints are in the robot's qpos. Shape (num_joints,), int."""
         self.joint_range = np.array([model.joint(joint).range for joint in joints])
         """Limits of the arm joints [rad]. Shape (num_joints, 2)."""
-        for joint, limits in morphology.arm_limits.items():
-            model.joint(joint).range = limits
+        for joint, (low, high) in (*morphology.arm_limits.items(), *arm_limits.items()):
+            least, most = model.joint(joint).range
+            model.joint(joint).range = max(low, least), min(high, most)
         dofs = [int(model.joint(joint).dofadr[0]) for joint in joints]
         self._configuration = mink.Configuration(model)
         self._tasks = {
