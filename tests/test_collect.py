@@ -552,6 +552,19 @@ def test_bad_flags(flags, message, capsys, tmp_path):
     assert capsys.readouterr().err.startswith(message)
 
 
+def test_a_full_disk_ends_in_a_line(tmp_path, capsys, monkeypatch):
+    def is_full(*_: object) -> None:
+        raise OSError(28, "No space left on device", "data/file-000.parquet")
+
+    monkeypatch.setattr("xop_lerobot.dataset.collect.collect", is_full)
+    flags = ["--robot=g1", "--task=dual_point_touch", "--episodes=1", f"--root={tmp_path}/a"]
+    assert main(flags) == 1
+    assert capsys.readouterr().err == (
+        "error: [Errno 28] No space left on device: 'data/file-000.parquet'. The same command goes "
+        "on with what is finished\n"
+    )
+
+
 def test_last_line_is_json(serial, tmp_path, capsys):
     root = tmp_path / "data"
     shutil.copytree(serial, root)

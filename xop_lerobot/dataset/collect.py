@@ -147,6 +147,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except XopError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, WorkerFailed) else 2
+    except OSError as error:  # a full disk, for example
+        print(f"error: {error}. The same command goes on with what is finished", file=sys.stderr)
+        return 1
     print(json.dumps(vars(result)))
     return 0
 
