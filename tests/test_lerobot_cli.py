@@ -26,7 +26,7 @@ from xop_lerobot.control.client import ControlClient
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.dataset.record import XopRecordConfig
 from xop_lerobot.dataset.xop_dataset import XopDataset
-from xop_lerobot.errors import XopError
+from xop_lerobot.errors import BadValue, XopError
 from xop_lerobot.link import get_session
 
 REPO = Path(__file__).parents[1]
@@ -189,6 +189,12 @@ def test_lerobot_train_takes_state_and_pictures(policy):
 @pytest.mark.slow
 def test_lerobot_rollout(policy, tmp_path, monkeypatch):
     root = tmp_path / "data"
+    executed, execute = [], toy_robot.XopToy.send_action
+    monkeypatch.setattr(
+        toy_robot.XopToy,
+        "send_action",
+        lambda self, action: executed.append(execute(self, action)) or executed[-1],
+    )
     flags = [*ROBOT, *TELEOP, f"--policy.path={policy}", "--device=cpu", "--fps=25"]
     flags += ["--strategy.type=episodic", "--task=play", "--play_sounds=false"]
     flags += ["--strategy.smooth_handover=false"]
@@ -202,6 +208,22 @@ def test_lerobot_rollout(policy, tmp_path, monkeypatch):
     assert np.diff(times) == pytest.approx(0.04, abs=1e-6)
     assert not any(dataset.hf_dataset["operator.engaged"])
     assert any(np.ravel(dataset.hf_dataset["robot.head"]))
+    # What was executed, and not what the policy asked for.
+    actions = np.array([list(action.values()) for action in executed[:50]], np.float32)
+    assert np.array_equal(np.stack(dataset.hf_dataset["action"]), actions)
+
+
+@pytest.mark.slow
+def test_a_policy_of_another_size_is_refused(policy, tmp_path, monkeypatch):
+    """Before the robot is connected, and before a dataset is made."""
+    monkeypatch.setattr("toy_robot.XopToy.connect", lambda *_: 1 / 0)
+    robot = ("--robot.type=xop_toy", "--robot.width=96", "--robot.height=72")
+    flags = [*robot, *TELEOP, f"--policy.path={policy}", "--device=cpu", "--fps=25"]
+    flags += ["--strategy.type=episodic", "--task=play", "--play_sounds=false"]
+    flags += record_flags(tmp_path / "data", repo_id="local/rollout_toy")
+    with pytest.raises(BadValue, match="Use --robot.width=64 --robot.height=48$"):
+        run(monkeypatch, "lerobot-rollout", *flags)
+    assert not (tmp_path / "data").exists()
 
 
 # Mistakes.

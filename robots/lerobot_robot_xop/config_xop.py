@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from lerobot.robots.config import RobotConfig
 
+from xop_lerobot.dataset.rollout_pictures import watch_rollouts
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
 from xop_lerobot.tasks.task import get_task
@@ -91,6 +92,7 @@ class XopRobotConfig(RobotConfig):
         if len(set(self.cameras)) < len(self.cameras):
             raise BadValue(f"robot.cameras names a camera twice: {', '.join(self.cameras)}")
         self.make_simulation_config()
+        watch_rollouts()
 
     @property
     def scene(self) -> str:
