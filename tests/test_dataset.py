@@ -28,6 +28,7 @@ from toy_robot import make_teleop, make_toy
 from xop_lerobot.command import Mode
 from xop_lerobot.dataset import durability, embedding
 from xop_lerobot.dataset.columns import COST_NAMES, HEALTH_NAMES, Columns
+from xop_lerobot.dataset.executed import put_executed
 from xop_lerobot.dataset.facts import compute_config_hash, read_facts
 from xop_lerobot.dataset.record import build_features
 from xop_lerobot.dataset.shutdown import hold_signals
@@ -39,7 +40,7 @@ from xop_lerobot.dataset.xop_dataset import (
     XopDataset,
 )
 from xop_lerobot.errors import BadValue, LinkError, XopError
-from xop_lerobot.link import Outcome, TickRecord, get_session
+from xop_lerobot.link import Executed, Outcome, TickRecord, get_session
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.state import FRAMES, Goal
 
@@ -300,6 +301,52 @@ def test_frames_that_a_policy_drives_have_no_operator(session, pair, tmp_path):
     rows = read_rows(dataset.root)
     assert stack(rows, "operator.engaged")[:, 0].tolist() == [True, False]
     assert not stack(rows, "goal.head")[1].any()
+
+
+def test_the_action_is_what_the_robot_executes(session, pair, tmp_path):
+    """A policy may ask for more than the limits let through."""
+    robot, teleop = pair
+    dataset = create(session, robot, tmp_path / "data")
+    rest = robot.morphology.layout.to_dict(robot._last_action)
+    executed = []
+    for _ in range(2):
+        tick(robot, teleop, dataset, act={**rest, "lift.pos": 9.0, "left_elbow.pos": -3.0})
+        executed.append(list(robot.morphology.layout.to_dict(robot._last_action).values()))
+    dataset.save_episode()
+    dataset.finalize()
+    actions = stack(read_rows(dataset.root), "action")
+    assert np.array_equal(actions, np.array(executed, np.float32))
+    assert 0 < actions[0, 0] < actions[1, 0] < 0.15
+
+
+def test_actions_of_another_tick_or_robot_stay(session, pair, tmp_path):
+    features = build_features(pair[0], use_videos=True)
+    observation = pair[0].get_observation()
+    executed = Executed(observation, pair[1].get_action())
+    state = build_dataset_frame(features, observation, prefix=OBS_STR)["observation.state"]
+    asked = np.full(6, 9.0, np.float32)
+    frame = {"observation.state": state, "action": asked}
+    assert put_executed(frame, None, features)["action"] is asked
+    assert put_executed(frame, executed, features)["action"] is not asked
+    late = frame | {"observation.state": state + 1}
+    assert put_executed(late, executed, features)["action"] is asked
+    hand = features | {"action": {"dtype": "float32", "shape": (1,), "names": ["hand.x"]}}
+    assert put_executed(frame, executed, hand)["action"] is asked
+    assert frame["action"] is asked
+
+
+def test_frames_that_were_kept_back_are_refused(session, pair, tmp_path):
+    """Their columns would be those of a later moment."""
+    robot, teleop = pair
+    dataset = create(session, robot, tmp_path / "data")
+    observation = robot.get_observation()
+    action = teleop.get_action()
+    robot.send_action(action)
+    frame = build_dataset_frame(dataset.features, observation, prefix=OBS_STR)
+    frame |= build_dataset_frame(dataset.features, action, prefix=ACTION)
+    dataset.add_frame({**frame, "task": "play"})
+    with pytest.raises(BadValue, match="^a frame came late: .* use another strategy, or --teleop"):
+        dataset.add_frame({**frame, "task": "play"})
 
 
 def test_an_episode_ends_by_itself(session, pair, tmp_path):

@@ -102,6 +102,19 @@ class Outcome:
     done: bool
 
 
+@dataclass(frozen=True)
+class Executed:
+    """What a robot really executes of the action that it was sent last.
+
+    Attributes:
+        observation: The proprioception that it was sent after, by key.
+        action: What is executed, limits applied, by action key.
+    """
+
+    observation: Mapping[str, float]
+    action: Mapping[str, float]
+
+
 class Recorder(Protocol):
     """Who records the session."""
 
@@ -126,6 +139,7 @@ class Session:
         state: State that the robot published last.
         tick: Record of the teleoperator's last tick.
         outcome: Outcome of the task after the last action, None where no task runs.
+        executed: What the robot executes of the last action; None before the first.
         view: What a person could see of the robot and its task now, None where no task runs.
         obstacles: Walls and furniture of the episode, None where no task places any.
         episode: Index of the episode being recorded; the robot's seed depends on it.
@@ -144,6 +158,7 @@ class Session:
         self.state: RobotState | None = None
         self.tick: TickRecord | None = None
         self.outcome: Outcome | None = None
+        self.executed: Executed | None = None
         self.view: View | None = None
         self.obstacles: tuple[Obstacle, ...] | None = None
         self.episode = 0
@@ -192,7 +207,8 @@ class Session:
         return self.recorder.grant(wish)
 
     def _forget(self) -> None:
-        self.state = self.tick = self.outcome = self.view = self.obstacles = None
+        self.state = self.tick = self.outcome = self.executed = None
+        self.view = self.obstacles = None
         self.pictures = {}
 
     @property

@@ -12,7 +12,7 @@ from lerobot.robots.robot import Robot
 from lerobot_robot_xop.config_xop import XopG1Config, XopRby1Config, XopRobotConfig
 from xop_lerobot.dataset.body import Body
 from xop_lerobot.errors import NotConnected, UnknownName
-from xop_lerobot.link import RobotInfo, get_session
+from xop_lerobot.link import Executed, RobotInfo, get_session
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.mistakes import report_mistakes
 from xop_lerobot.morphology.morphology import make_morphology
@@ -58,6 +58,7 @@ class XopRobot(Robot):
         self._plant: Simulation | None = None
         self._stage: Stage | None = None
         self._loop: PolicyLoop | RealtimeLoop | None = None
+        self._proprioception: dict[str, float] = {}
         self._info = RobotInfo(
             name=self.name,
             morphology=self.morphology,
@@ -171,7 +172,8 @@ class XopRobot(Robot):
         assert self._plant is not None
         pictures = {camera: self._plant.render(camera) for camera in self.cameras}
         self._session.pictures = pictures
-        return {**self._body.compute_proprioception(state), **pictures}
+        self._proprioception = self._body.compute_proprioception(state)
+        return {**self._proprioception, **pictures}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         """Execute `action` for one control period.
@@ -198,7 +200,9 @@ class XopRobot(Robot):
         self._last_action = loop.execute(wanted, 1 / self.config.fps)
         if self._stage is not None:
             self._session.outcome = self._stage.update()
-        return layout.to_dict(self._last_action)
+        executed = layout.to_dict(self._last_action)
+        self._session.executed = Executed(self._proprioception, executed)
+        return dict(executed)
 
     def disconnect(self) -> None:
         """Stop the robot and leave the session; may be called twice."""

@@ -25,6 +25,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from xop_lerobot.dataset import durability
 from xop_lerobot.dataset.columns import Columns, has_all_columns, is_own_column
 from xop_lerobot.dataset.embedding import skip_embedding
+from xop_lerobot.dataset.executed import put_executed
 from xop_lerobot.dataset.facts import (
     FACT_COLUMNS,
     FACTS_PREFIX,
@@ -51,6 +52,7 @@ from xop_lerobot.dataset.wishes import grant
 from xop_lerobot.errors import BadDataset, BadValue, XopError
 from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
 from xop_lerobot.operator.display import Cue, Progress, Wish
+from xop_lerobot.state import RobotState
 
 logger = logging.getLogger(__name__)
 
@@ -236,6 +238,7 @@ class XopDataset(LeRobotDataset):
         self._tick_limit: int | None = None
         self._stop_on_success = self._paused = False
         self._events: MutableMapping[str, bool] = {}
+        self._last_state: RobotState | None = None
         # Written with the first episode: a session that records none changes nothing.
         self._config = to_plain(self._session.configs)
         self._config_hash = compute_config_hash(self._config)
@@ -326,11 +329,24 @@ class XopDataset(LeRobotDataset):
         return told
 
     def add_frame(self, frame: dict) -> None:
-        """Add a frame with this tick's extra columns."""
+        """Add a frame with this tick's extra columns, and the action that the robot executes.
+
+        Raises:
+            BadValue: If the frame is of an earlier tick, whose columns nobody knows any more.
+            NotSaved: If it cannot be written; a full disk is the usual reason.
+        """
         session, tally = self._session, self._tally
         state, outcome = session.state, session.outcome
         tick = self._current_tick()
+        frame = put_executed(frame, session.executed, self.meta.features)
         if self._columns is not None and state is not None:
+            if state is self._last_state:
+                raise BadValue(
+                    "a frame came late: another one of the same tick is recorded already. "
+                    "--strategy.type=highlight keeps frames back, and their columns are gone then; "
+                    "use another strategy, or --teleop.record.columns=false"
+                )
+            self._last_state = state
             frame = {**frame, **self._columns.build_row(state, tick, outcome)}
         if not self._info.realtime:
             self._video.wait()
@@ -536,6 +552,7 @@ _KEPT = (
     "_stop_on_success",
     "_paused",
     "_events",
+    "_last_state",
     "_config",
     "_config_hash",
     "more_facts",
