@@ -19,6 +19,7 @@ import numpy as np
 
 import xop_lerobot.low_level.falcon  # noqa: F401 registers the policy
 from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -224,4 +225,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     main()

@@ -24,6 +24,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import UnknownName, XopError
 from xop_lerobot.evaluation.tracking import make_record, run_scenario, run_trial
 from xop_lerobot.evaluation.tracking_documents import write_documents
@@ -212,4 +213,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     sys.exit(main())

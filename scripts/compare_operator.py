@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import XopError
 from xop_lerobot.operator.simulated.comparison import (
     Motion,
@@ -76,4 +77,5 @@ def plot(motions: list[Motion], path: Path) -> None:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     main()

@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import UnknownName, XopError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -209,4 +210,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     sys.exit(main())

@@ -26,6 +26,7 @@ import torch
 from torch import nn
 
 from xop_lerobot.command import Mode
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.comparison import compare_policies, replace_table, write_table
 from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
@@ -403,4 +404,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     main()

@@ -17,6 +17,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.operator.devices.avp_protocol import AXES
 from xop_lerobot.operator.devices.axes import WORLD
 from xop_lerobot.operator.webxr.protocol import GRIPS, PARALLEL
@@ -92,4 +93,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     main()

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import BadValue, XopError
 
 if TYPE_CHECKING:
@@ -143,4 +144,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     main()

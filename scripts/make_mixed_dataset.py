@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from tqdm import tqdm
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import BadValue, XopError
 from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
 
@@ -388,4 +389,5 @@ def _run_calmly(target: Callable[..., None], *arguments: Any) -> None:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     sys.exit(main())

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import XopError
 from xop_lerobot.operator.clutch import Clutch
 from xop_lerobot.operator.clutch import Wish as ClutchWish
@@ -131,4 +132,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    make_output_readable()
     main()

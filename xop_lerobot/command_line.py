@@ -1,12 +1,58 @@
-"""What the commands of this project share: a parser whose errors are the project's own."""
+"""What the commands of this project share: a parser with the project's errors, readable output."""
 
 from __future__ import annotations
 
 import argparse
+import codecs
+import io
+import sys
+import unicodedata
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from xop_lerobot.errors import BadValue, UnknownName
+
+_SPELL_OUT = "xop-spell-out"
+_SPELLINGS = {
+    "…": "...", "–": "-", "—": "-", "−": "-", "→": "->", "×": "x", "·": ".", "±": "+/-",
+    "≤": "<=", "≥": ">=", "°": "deg", "‘": "'", "’": "'", "“": '"', "”": '"', "⚠": "!",
+}  # fmt: skip
+"""What is not just a letter with an accent, or a digit in another place."""
+
+
+def make_output_readable() -> None:
+    r"""Let what is printed be read in terminals that cannot show all of it, and never be an error.
+
+    Signs are spelt out, letters lose their accents, and anything else becomes its number, as in
+    Python: `1/s²`, `…`, `é` and `手` are `1/s2`, `...`, `e` and `\u624b` in ASCII. Streams that
+    are no terminal, such as pipes, are treated alike; those in UTF-8 stay as they are, but for
+    parts of paths that are no text at all. Each command calls it first.
+    """
+    codecs.register_error(_SPELL_OUT, _spell_out)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # and nothing that somebody has put in its place
+            stream.reconfigure(errors=_SPELL_OUT)
+
+
+def can_print_anything() -> bool:
+    """Whether standard output can show any text as it is."""
+    encoding = getattr(sys.stdout, "encoding", None) or ""
+    return encoding.lower().replace("-", "").startswith("utf")
+
+
+def _spell_out(error: UnicodeError) -> tuple[str, int]:
+    """Replace what an encoding does not have, as an error handler of `codecs` does."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    piece = error.object[error.start : error.end]
+    return "".join(map(_spell, piece)), error.end
+
+
+def _spell(character: str) -> str:
+    if character in _SPELLINGS:
+        return _SPELLINGS[character]
+    plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode("ascii")
+    return plain or character.encode("ascii", "backslashreplace").decode("ascii")
 
 
 class CommandParser(argparse.ArgumentParser):

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import XopError
 
 TRACEBACK_VARIABLE = "XOP_TRACEBACK"
@@ -34,6 +35,7 @@ def report_mistakes() -> None:
     stock = sys.excepthook
     if not program.startswith(_COMMANDS) or getattr(stock, "xop_stock", None):
         return
+    make_output_readable()
 
     def report(
         kind: type[BaseException], error: BaseException, trace: TracebackType | None

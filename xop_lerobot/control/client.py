@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.control.protocol import MAX_LINE, find_socket, read_object, write_object
 from xop_lerobot.errors import BadValue, XopError
 
@@ -159,6 +160,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run `xop-control`; a refusal ends in one line and status 1."""
+    make_output_readable()
     flags = make_parser().parse_args(arguments)
     try:
         path = find_socket(flags.socket, flags.session)

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.command_line import CommandParser, make_output_readable
 from xop_lerobot.dataset.collect_config import CollectConfig
 from xop_lerobot.dataset.collect_flags import add_config, add_crew, read_config
 from xop_lerobot.dataset.collect_folder import CollectFolder
@@ -136,6 +136,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[CollectConfig, argparse.N
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `xop-collect`; returns the exit code."""
+    make_output_readable()
     args = None
     try:
         config, args = parse_arguments(sys.argv[1:] if arguments is None else arguments)

@@ -44,6 +44,7 @@ from lerobot.utils.visualization_utils import (
 from lerobot_robot_xop import XopRobotConfig
 from lerobot_teleoperator_xop import XopConfig
 from lerobot_teleoperator_xop.terminal import listen_while_recording
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.dataset.host import count_ticks
 from xop_lerobot.dataset.resume import check_storage
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
@@ -273,6 +274,7 @@ def build_features(robot: Robot, *, use_videos: bool) -> dict[str, dict]:
 
 def main() -> None:
     """Run `xop-record`; a mistake of the user's ends in one line and not in a traceback."""
+    make_output_readable()
     register_third_party_plugins()
     try:
         record()  # pyright: ignore[reportCallIssue]  the parser makes the argument

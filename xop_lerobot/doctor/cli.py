@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.command_line import CommandParser, make_output_readable
 from xop_lerobot.doctor.certificate import check_certificate
 from xop_lerobot.doctor.cpu import check_cpu
 from xop_lerobot.doctor.disk import check_disk
@@ -125,6 +125,7 @@ def print_finding(name: str, finding: Finding) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `xop-doctor`; returns the exit status."""
+    make_output_readable()
     try:
         setup, names, as_json = parse_arguments(sys.argv[1:] if arguments is None else arguments)
     except XopError as error:

@@ -27,6 +27,7 @@ import mujoco.rollout
 import numpy as np
 
 from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import BadValue, UnknownName, XopError
 from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
 from xop_lerobot.evaluation.tracking_scenarios import bend_from, make_curve
@@ -331,6 +332,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[BenchConfig, argparse.Nam
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `xop-bench`; returns the exit code."""
+    make_output_readable()
     try:
         config, args = parse_arguments(sys.argv[1:] if arguments is None else arguments)
         figures = run_bench(config)

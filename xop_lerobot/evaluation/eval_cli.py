@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.command_line import CommandParser, make_output_readable
 from xop_lerobot.errors import BadValue, UnknownName, XopError
 
 logger = logging.getLogger(__name__)
@@ -311,6 +311,7 @@ def write_tables(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `xop-eval`; returns the exit code."""
+    make_output_readable()
     try:
         return run(parse_arguments(sys.argv[1:] if arguments is None else arguments))
     except XopError as error:

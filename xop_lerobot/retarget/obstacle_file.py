@@ -40,7 +40,7 @@ def load_obstacles(path: str | Path) -> tuple[Obstacle, ...]:
     import yaml  # noqa: PLC0415 (only who has such a file needs it)
 
     try:
-        content = load_yaml(Path(path).read_text())
+        content = load_yaml(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise BadObstacles(path, f"cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.command_line import CommandParser, make_output_readable
 from xop_lerobot.dataset.curate.verbs import VERBS, Verb, load_verb
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
 from xop_lerobot.errors import BadValue, UnknownName, XopError
@@ -46,6 +46,7 @@ def make_verb_parser(name: str, verb: Verb) -> CommandParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `xop-curate`; returns the exit code."""
+    make_output_readable()
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         if not words or words[0].startswith("-"):

@@ -21,7 +21,7 @@ from typing import IO, Any
 
 from tqdm import tqdm
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.command_line import CommandParser, can_print_anything
 from xop_lerobot.dataset.curate.arguments import add_source, show_progress
 from xop_lerobot.dataset.curate.expression import UnknownFigure
 from xop_lerobot.dataset.curate.figures import FIGURES, KINDS, describe_figures
@@ -123,7 +123,7 @@ def _open_list(file: str | None) -> Iterator[Any]:
         yield lambda row: None
         return
     if file == _STANDARD_OUTPUT:
-        writer = _ListWriter(sys.stdout)
+        writer = _ListWriter(sys.stdout, as_ascii=not can_print_anything())
         yield writer.write
         writer.close()
         return
@@ -147,12 +147,13 @@ def _open_list(file: str | None) -> Iterator[Any]:
 class _ListWriter:
     """Writes a JSON list to a stream, an object a line."""
 
-    def __init__(self, stream: IO[str]) -> None:
+    def __init__(self, stream: IO[str], *, as_ascii: bool = False) -> None:
         self._stream, self._separator = stream, "[\n"
+        self._as_ascii = as_ascii
 
     def write(self, row: Mapping[str, Any]) -> None:
         """Write one object."""
-        text = json.dumps(row, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(row, allow_nan=False, ensure_ascii=self._as_ascii)
         self._stream.write(f"{self._separator}{text}")
         self._separator = ",\n"
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from xop_lerobot.command_line import can_print_anything
 from xop_lerobot.errors import BadValue, XopError
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.live import SILENT_S, LiveDevice, StreamStatus
@@ -100,7 +101,7 @@ class WebXrDevice(LiveDevice):
 
     def _invite(self) -> None:
         fingerprint = self.certificate.fingerprint if self.certificate is not None else ""
-        qr = sys.stdout.isatty()
+        qr = sys.stdout.isatty() and can_print_anything()
         print(write_invitation(self.host, self.port, self.tls, self.code, fingerprint, qr))
 
     def disconnect(self) -> None:
