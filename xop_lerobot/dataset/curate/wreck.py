@@ -377,22 +377,27 @@ class Videos:
                 start, stop = (round(each * self._fps) for each in (span.start, span.stop))
                 spans.setdefault(span.file, []).append((start, stop, index))
         gaps: list[_Gap] = []
-        owners: list[int | None] = []  # of what lies there, one after another; None for a gap
+        held: list[tuple[int | None, _Gap | None]] = []  # what lies there, one after another
         for file in self._list(key):
             place, size = 0, self._count(file)
             for start, stop, index in sorted(spans.get(file, ())):
                 if start > place:
                     gaps.append(_Gap(file, place, start - place, is_tail=False))
-                    owners.append(None)
-                owners.append(index)
+                    held.append((None, gaps[-1]))
+                held.append((index, None))
                 place = max(place, stop)
             if size > place:
                 gaps.append(_Gap(file, place, size - place, is_tail=True))
-                owners.append(None)
-        places = [place for place, owner in enumerate(owners) if owner is None]
-        for gap, place in zip(gaps, places, strict=True):
-            gap.low = max((each for each in owners[:place] if each is not None), default=-1)
-            gap.high = min((each for each in owners[place:] if each is not None), default=np.inf)
+                held.append((None, gaps[-1]))
+        low, high = -1, np.inf
+        for index, gap in held:
+            low = low if index is None else max(low, index)
+            if gap is not None:
+                gap.low = low
+        for index, gap in reversed(held):
+            high = high if index is None else min(high, index)
+            if gap is not None:
+                gap.high = high
         return gaps
 
     def _claim(self, key: str, gaps: list[_Gap], sought: Sequence[EpisodeEntry]) -> None:
