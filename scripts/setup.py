@@ -65,11 +65,12 @@ PYTHON_HEADERS = {"apt-get": "python{}-dev", "dnf": "python{}-devel", "zypper": 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 """Programs that `tests/browser.py` starts, whichever is found first."""
 TEST_PACKAGES = {
-    "apt-get": {"Chromium": "chromium", "certutil": "libnss3-tools"},
-    "dnf": {"Chromium": "chromium", "certutil": "nss-tools"},
-    "pacman": {"Chromium": "chromium", "certutil": "nss"},
-    "zypper": {"Chromium": "chromium", "certutil": "mozilla-nss-tools"},
+    "apt-get": {"Chromium": "chromium", "certutil": "libnss3-tools", "npm": "npm"},
+    "dnf": {"Chromium": "chromium", "certutil": "nss-tools", "npm": "npm"},
+    "pacman": {"Chromium": "chromium", "certutil": "nss", "npm": "npm"},
+    "zypper": {"Chromium": "chromium", "certutil": "mozilla-nss-tools", "npm": "npm-default"},
 }
+"""What tests of pages need beside: npm brings Node.js, and fetches the headset's emulator."""
 INSTALL_COMMANDS = {
     "apt-get": ("apt-get", "install", "-y", "--no-install-recommends"),
     "dnf": ("dnf", "install", "-y"),
@@ -193,7 +194,7 @@ def has_browser() -> bool:
 def list_missing_test_tools() -> list[str]:
     """List what the tests of pages lack here; they skip without it."""
     missing = [] if has_browser() else ["Chromium"]
-    return missing + ([] if shutil.which("certutil") else ["certutil"])
+    return missing + [tool for tool in ("certutil", "npm") if not shutil.which(tool)]
 
 
 def bring_test_tools() -> None:
@@ -223,7 +224,9 @@ def bring_test_tools() -> None:
     if "Chromium" in missing:
         ways += f"\nor, for Chromium:\n  {PYTHON} -m playwright install --with-deps chromium"
     verb = "is" if len(missing) == 1 else "are"
-    say(f"{' and '.join(missing)} {verb} missing: tests of pages will skip. {ways}")
+    *others, last = missing
+    named = f"{', '.join(others)} and {last}" if others else last
+    say(f"{named} {verb} missing: tests of pages will skip. {ways}")
 
 
 def say(line: str) -> None:

@@ -280,7 +280,7 @@ def test_a_failing_pip_shows_the_end_of_its_output(
 # -- what the tests of pages need -----------------------------------------------------------
 
 
-PROGRAMS = {"chromium": "chromium", "libnss3-tools": "certutil"}
+PROGRAMS = {"chromium": "chromium", "libnss3-tools": "certutil", "npm": "npm"}
 
 
 @pytest.fixture
@@ -328,18 +328,19 @@ def run_setup(setup: ModuleType, monkeypatch: pytest.MonkeyPatch, *flags: str) -
 def test_what_the_tests_of_pages_need_is_installed_once(
     setup: ModuleType, apt: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    (apt / "shelf").write_text("chromium\nlibnss3-tools\n")
-    assert setup.list_missing_test_tools() == ["Chromium", "certutil"]
+    (apt / "shelf").write_text("chromium\nlibnss3-tools\nnpm\n")
+    assert setup.list_missing_test_tools() == ["Chromium", "certutil", "npm"]
     assert run_setup(setup, monkeypatch, "--test-tools") == 0
     install = "install -y --no-install-recommends"
-    assert get_asked(apt) == ["update", f"{install} chromium", f"{install} libnss3-tools"]
+    packages = ("chromium", "libnss3-tools", "npm")
+    assert get_asked(apt) == ["update", *(f"{install} {name}" for name in packages)]
     told = capsys.readouterr().out
     assert told == (
-        "Installing for the tests: chromium libnss3-tools (XOP_NO_SYSTEM=1 forbids it)\n"
+        "Installing for the tests: chromium libnss3-tools npm (XOP_NO_SYSTEM=1 forbids it)\n"
     )
     # The next time there is nothing to do, and nothing is asked or said.
     assert run_setup(setup, monkeypatch, "--test-tools") == 0
-    assert len(get_asked(apt)) == 3
+    assert len(get_asked(apt)) == 4
     assert capsys.readouterr().out == ""
 
 
@@ -347,7 +348,7 @@ def test_a_system_without_chromium_still_gets_the_rest(
     setup: ModuleType, apt: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """As Ubuntu, whose apt has no Chromium."""
-    (apt / "shelf").write_text("libnss3-tools\n")
+    (apt / "shelf").write_text("libnss3-tools\nnpm\n")
     assert run_setup(setup, monkeypatch, "--test-tools") == 0
     assert setup.list_missing_test_tools() == ["Chromium"]
     assert capsys.readouterr().out.splitlines()[1:] == [
@@ -366,8 +367,10 @@ def test_without_a_mirror_the_tests_run_all_the_same(
 ) -> None:
     assert run_setup(setup, monkeypatch, "--test-tools") == 0
     told = capsys.readouterr().out
-    assert "Chromium and certutil are missing: tests of pages will skip. Run:\n" in told
-    assert "\n  sudo apt-get install -y --no-install-recommends chromium libnss3-tools\n" in told
+    assert "Chromium, certutil and npm are missing: tests of pages will skip. Run:\n" in told
+    assert (
+        "\n  sudo apt-get install -y --no-install-recommends chromium libnss3-tools npm\n" in told
+    )
     assert "no mirror answers" in setup.LOG.read_text()
 
 
@@ -384,7 +387,7 @@ def test_tools_that_may_not_be_installed_are_told_as_a_command(
     assert run_setup(setup, monkeypatch, "--test-tools") == 0
     assert get_asked(apt) == []
     told = capsys.readouterr().out
-    assert told.startswith("Chromium and certutil are missing: tests of pages will skip. ")
+    assert told.startswith("Chromium, certutil and npm are missing: tests of pages will skip. ")
     if manager is None:
         assert "Install with the system's package manager\n" in told
     else:
