@@ -24,13 +24,16 @@ from xop_lerobot.transforms import (
 
 AT_REST_S = 20.0
 """Time after which a robot has taken a command up, whatever its lags [s]."""
-_COUNT = 400  # postures that are drawn at first
-_MISSED = 4e-4  # cost from which a goal counts as missed, and others are tried: 2 cm
+_COUNT = 1000  # postures that are drawn at first
+MISSED = 4e-4  # cost from which a goal counts as missed, and others are tried: 2 cm
 _BETTER, _SHARE = 4e-4, 0.8  # by which, and to what share, another posture must be cheaper
 _PERIOD = 25  # solves after which another start is tried though nothing is missed
 _NEARBY, _OTHER = 6, 12  # iterations from the last posture, and from elsewhere
-_STARTS = 6  # starts that are tried in turn
+_STARTS = 7  # starts that are tried in turn; odd: each within the limits, then beyond
 _FAR = 0.12  # distance of a posture from which on the way there is looked at, of scale
+_ARRIVED = 0.05  # distance at which a detour has come to its end
+_NEARER, _PATIENCE = 0.02, 8  # by which a posture has to come nearer within so many solves
+_STUCK = 1.6e-3  # cost from which on it has to: 4 cm
 
 
 class Found(NamedTuple):
@@ -128,7 +131,9 @@ class PostureSearch:
         strict: bool = False,
     ) -> None:
         self.problem, self._repertoire, self._used = problem, repertoire, used
-        self._limits, self._strict = limits, strict
+        self.space = problem.command_model.space
+        self._limits = tuple(self.space.restrict(each, Mode.STATIONARY) for each in limits)
+        self._strict = strict
         self._heeded = used & ~problem.command_model.is_velocity()
         self.reset()
 
@@ -136,7 +141,8 @@ class PostureSearch:
         """Forget the last solution."""
         self._last: np.ndarray | None = None
         self._turn = self._quiet = 0
-        self._beyond = False
+        self._beyond = self._detours = False
+        self._left, self._waited = np.inf, 0
 
     def find(
         self,
@@ -157,8 +163,12 @@ class PostureSearch:
             offset: As for `CommandModel.extrapolate`. Shape (k,).
             settled: As for `CommandModel.extrapolate`. Shape (k,).
         """
+        low, high = self._limits
+        everywhere = (self.space.low, self.space.high)
 
-        def solve(start: np.ndarray, iterations: int, *, beyond: bool) -> Solution:
+        def solve(
+            start: np.ndarray, iterations: int, bounds: tuple[np.ndarray, np.ndarray]
+        ) -> Solution:
             return self.problem.solve_from(
                 qpos,
                 {name: goal},
@@ -168,40 +178,53 @@ class PostureSearch:
                 free=self._used & self.problem.command_model.acting(Mode.STATIONARY),
                 offset=offset,
                 settled=settled,
-                bounds=None if beyond else self._limits,
+                bounds=bounds,
                 iterations=iterations,
             )
 
         start = executed if self._last is None else self._last
-        best = solve(start, _NEARBY, beyond=self._beyond)
-        if self._beyond and best.missed > _MISSED:  # there is no need to be beyond
+        best = solve(start, _NEARBY, everywhere if self._beyond else self._limits)
+        if self._beyond and best.missed > MISSED:  # there is no need to be beyond
             self._beyond = False
-            best = solve(start, _OTHER, beyond=False)
+            best = solve(start, _OTHER, self._limits)
         self._quiet += 1
-        if best.missed > _MISSED or self._quiet >= _PERIOD:
+        if best.missed > MISSED or self._quiet >= _PERIOD:
             self._quiet = 0
-            beyond = not self._strict and best.missed > _MISSED and self._turn % 2 == 1
-            other = solve(self._choose_start(qpos, goal, executed), _OTHER, beyond=beyond)
+            beyond = not self._strict and best.missed > MISSED and self._turn % 2 == 1
+            start = self._choose_start(qpos, goal, executed)
+            other = solve(start, _OTHER, everywhere if beyond else self._limits)
             better = other.cost < _SHARE * best.cost - _BETTER
-            if better and (not beyond or other.missed <= _MISSED):
+            if better and (not beyond or other.missed <= MISSED):
                 best, self._beyond = other, beyond
-        detour = False
         apart = np.abs(best.command - executed)[self._heeded] / self.problem.scale[self._heeded]
-        if apart.max(initial=0.0) > _FAR:
-            near = solve(executed, _OTHER, beyond=self._beyond)
-            detour = _SHARE * near.cost > best.cost + _BETTER
-            if not detour:
-                best = near
+        left = float(apart.max(initial=0.0))
+        if left <= _FAR:
+            self._detours = self._detours and left > _ARRIVED
+        else:
+            near = solve(executed, _OTHER, (np.minimum(low, executed), np.maximum(high, executed)))
+            elsewhere = _SHARE * near.cost > best.cost + _BETTER
+            self._detours |= elsewhere or self._is_stuck(left, solve(executed, 1, everywhere))
+            inside = bool(((near.command >= low) & (near.command <= high)).all())
+            if not elsewhere and (inside or (near.missed <= MISSED and not self._strict)):
+                best, self._beyond = near, not inside
         self._last = best.command
-        return Found(best.command, best.missed, detour)
+        return Found(best.command, best.missed, self._detours)
+
+    def _is_stuck(self, left: float, now: Solution) -> bool:
+        """Whether a robot that misses its goal has not come nearer to the posture for a while."""
+        if now.missed <= _STUCK or left < self._left - _NEARER:
+            self._left, self._waited = left, 0
+        self._waited += 1
+        return self._waited > _PATIENCE
 
     def _choose_start(self, qpos: np.ndarray, goal: np.ndarray, executed: np.ndarray) -> np.ndarray:
         """The start whose turn it is. Shape (k,)."""
-        turn, self._turn = self._turn, (self._turn + 1) % _STARTS
+        turn = self._turn % _STARTS
+        self._turn += 1
         if turn == 0:
             return executed
         if turn == 1:
-            return self.problem.command_model.space.neutral
+            return self.space.neutral
         count = _STARTS - 2
         starts = self._repertoire.choose(qpos[:7], goal, self.problem.weights, count)
         return starts[(turn - 2) % len(starts)]

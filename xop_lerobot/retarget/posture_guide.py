@@ -16,7 +16,7 @@ from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
 from xop_lerobot.retarget.config import MpcConfig
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.linearisation import Placement
-from xop_lerobot.retarget.posture import AT_REST_S, Found, PostureSearch, Repertoire
+from xop_lerobot.retarget.posture import AT_REST_S, MISSED, Found, PostureSearch, Repertoire
 from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
 from xop_lerobot.retarget.static_load import StaticLoad
 from xop_lerobot.state import Goal
@@ -35,6 +35,8 @@ from xop_lerobot.transforms import (
 HEAD = "head"
 _EFFORT, _LEVEL_EFFORT = 0.002, 0.01  # of a posture, which has all the time to get there
 _NEAR, _SAME = 0.01, 0.03  # by which a goal may be missed before it is moved [m], [rad]
+_EXTEND = 0.02  # by which the reach of a robot that stands changes in a solve [m]
+_FARTHEST = 1.0  # its largest [m]
 _CREEP = 0.02  # speed that counts as none [m/s], [rad/s]
 _BEYOND = 0.6  # turn past half a turn at which the other way round is taken [rad]
 
@@ -74,12 +76,12 @@ class PostureGuide:
     """Tells in which posture the robot would be at the head's goal, and how much it misses.
 
     In stationary mode that is a posture for the whole pose, on the feet or the base that stand.
-    First the goal is held near the place where the head rests, and its heading within what the
-    waist turns: what is further off cannot be served, and would only contort the robot. What
-    still brakes after a change of mode keeps its posture until it stands: a torso that leans after
-    its goal, or back, meanwhile needs more torque than it has. A robot
-    that drives is in the right posture when height and nod are right: the rest is the wheels'.
-    A walking robot, which takes no posture, gets none.
+    First the goal is held near the place where the head rests, unless the robot can be where it
+    is, and its heading within what the waist turns: what cannot be served would only contort the
+    robot. What still brakes after a change of mode keeps its posture until it stands: a torso
+    that leans after its goal, or back, meanwhile needs more torque than it has. A robot that
+    drives is in the right posture when height and nod are right: the rest is the wheels'. A
+    walking robot, which takes no posture, gets none.
 
     Args:
         morphology: The robot.
@@ -118,16 +120,18 @@ class PostureGuide:
         self._limits = (low, high)
         self._searches: dict[Mode, PostureSearch] = {}
         self._level: PostureSearch | None = None
+        self._free: PostureSearch | None = None
         self.reset()
 
     def configure(self, configs: Mapping[Mode, MpcConfig], sites: Mapping[str, str]) -> None:
         """Take other parameters or targets; there are postures for a head alone."""
-        self._searches, self._level = {}, None
-        self._beside = 0.0
+        self._searches, self._level, self._free = {}, None, None
+        self._start()
         if HEAD not in sites:
             return
         still = configs[Mode.STATIONARY]
         self._searches[Mode.STATIONARY] = self._make_search(still, level=False)
+        self._free = self._make_search(still, level=False)
         self._level = self._make_search(still, level=True)
         if self._command_model.is_nonholonomic:
             self._searches[Mode.MOBILE] = self._make_search(
@@ -163,10 +167,13 @@ class PostureGuide:
 
     def reset(self) -> None:
         """Start anew."""
-        for search in (*self._searches.values(), self._level):
+        for search in (*self._searches.values(), self._level, self._free):
             if search is not None:
                 search.reset()
-        self._beside = 0.0
+        self._start()
+
+    def _start(self) -> None:
+        self._beside, self._reach = 0.0, self._morphology.standing_reach
 
     def hold(
         self,
@@ -185,24 +192,36 @@ class PostureGuide:
             offset: As for `CommandModel.extrapolate`. Shape (n,).
             settled: As for `CommandModel.extrapolate`. Shape (n,).
         """
-        if self._level is None or goal.mode is not Mode.STATIONARY or HEAD not in goal.poses:
+        if (
+            self._level is None
+            or self._free is None
+            or goal.mode is not Mode.STATIONARY
+            or HEAD not in goal.poses
+        ):
             return goal
         pose = goal.poses[HEAD].copy()
+        arguments = (executed, offset, settled)
         heading = float(quat_yaw(qpos[3:7]))
         ahead = np.array([math.cos(heading), math.sin(heading)])
         axes = np.stack([ahead, [-ahead[1], ahead[0]]])
         place = axes @ (pose[:2] - qpos[:2])
-        reach = self._morphology.standing_reach
-        if math.dist(place, self._resting) > reach:
+        beyond = self._compute_turn_beyond(pose[3:], heading)
+        is_far = math.dist(place, self._resting) > self._morphology.standing_reach
+        reachable = False
+        if beyond or is_far:
+            reachable = self._free.find(HEAD, qpos, pose, *arguments).missed <= MISSED
+        if beyond and not reachable:  # a tilted head may look further aside than the waist turns
+            pose[3:] = quat_multiply(quat_from_yaw(-beyond), pose[3:])
+            reachable = self._free.find(HEAD, qpos, pose, *arguments).missed <= MISSED
+        self._adapt_reach(reachable and is_far)
+        if is_far:
             # Who bows or squats has the head elsewhere; up to there it is no matter of reach.
-            found = self._level.find(HEAD, qpos, pose, executed, offset, settled)
+            found = self._level.find(HEAD, qpos, pose, *arguments)
             bowed, _ = self._place(qpos, found.command, offset, settled)
             bowed = axes @ (bowed[:2] - qpos[:2])
-            place = _hold_near_line(place, self._resting, bowed, reach)
+            place = _hold_near_line(place, self._resting, bowed, self._reach)
             pose[:2] = qpos[:2] + place @ axes
-        pose[3:] = self._hold_heading(pose[3:], heading)
-        poses = {**goal.poses, HEAD: pose}
-        return dataclasses.replace(goal, poses=poses)
+        return dataclasses.replace(goal, poses={**goal.poses, HEAD: pose})
 
     def _is_braking(self, executed: np.ndarray) -> bool:
         """Whether more is executed than what sways a robot that stands."""
@@ -210,8 +229,14 @@ class PostureGuide:
         twist = self._command_model.compute_twist(executed)
         return bool((np.abs(twist) > sway + _CREEP).any())
 
-    def _hold_heading(self, quat: np.ndarray, base: float) -> np.ndarray:
-        """Turn a goal back to where the waist can look, on the side where it was. (4,)."""
+    def _adapt_reach(self, reachable: bool) -> None:
+        """Let the goal go further off where the robot can be there, and take it back where not."""
+        least = self._morphology.standing_reach
+        change = _EXTEND if reachable else -_EXTEND
+        self._reach = min(max(self._reach + change, least), _FARTHEST)
+
+    def _compute_turn_beyond(self, quat: np.ndarray, base: float) -> float:
+        """How far a goal looks beyond what the waist turns, on the side where it was [rad]."""
         beside = float(compute_heading(quat)) - base
         beside = self._beside + math.remainder(beside - self._beside, math.tau)
         if abs(beside) > math.pi + _BEYOND:
@@ -219,10 +244,7 @@ class PostureGuide:
         self._beside = beside
         space = self._command_model.space
         waist = self._vertical & self._command_model.acting(Mode.STATIONARY)
-        held = min(max(beside, space.low[waist].sum()), space.high[waist].sum())
-        if held == beside:
-            return quat
-        return quat_multiply(quat_from_yaw(held - beside), quat)
+        return beside - min(max(beside, space.low[waist].sum()), space.high[waist].sum())
 
     def find(
         self,
