@@ -129,7 +129,7 @@ class RBY1(Morphology):
     support = SUPPORT
     has_stiff_body = True
     # Moving, its servos are behind by 0.03 rad at most; a torso that folds leaves 0.3 to 1.5.
-    servo_gap = 0.1
+    servo_gap = 0.15
     posture_limits = POSTURE_LIMITS
     standing_reach = STANDING_REACH
     hull_points = HULL
