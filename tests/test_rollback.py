@@ -91,7 +91,7 @@ def test_a_full_disk_costs_one_episode(
     dataset.finalize()
     assert str(caught.value) == (
         f"episode 2 could not be saved to '{root}': {FULL}. What was saved before it is whole: 2 "
-        "episodes. Mend that, make room for example, and go on with --resume=true"
+        "episodes. Once that is mended, --resume=true goes on"
     )
     assert read_files(root) == before
     assert not list(root.glob("tmp*"))

@@ -33,7 +33,9 @@ def put_executed(
         return frame
     state = _build(OBS_STATE, executed.observation, features)
     action = _build(ACTION, executed.action, features)
-    if state is not None and action is not None and np.array_equal(state, frame.get(OBS_STATE)):
+    if state is None or action is None or OBS_STATE not in frame:
+        return frame
+    if np.array_equal(state, frame[OBS_STATE]):
         frame[ACTION] = action
     return frame
 

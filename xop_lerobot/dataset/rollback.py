@@ -50,8 +50,8 @@ class NotSaved(XopError):
             )
         elif index:
             text += (
-                f"What was saved before it is whole: {say_count(index, 'episode')}. Mend that, "
-                "make room for example, and go on with --resume=true"
+                f"What was saved before it is whole: {say_count(index, 'episode')}. Once that is "
+                "mended, --resume=true goes on"
             )
         else:
             text += "None was saved before it"
