@@ -168,9 +168,9 @@ def test_clock_that_was_set_is_named_and_harms_nothing(data, capsys):
     code, rows, _ = inspect(data, capsys)
     assert code == 1
     assert [row["problems"] for row in rows[:3]] == [
-        ["the clock 'time.wall' was set by +3600 s at row 50 of episode 0; it is replayed without"],
+        ["the clock 'time.wall' jumps by +3600 s at row 50 of episode 0; it is replayed without"],
         [],
-        ["the clock 'time.wall' was set by -30 s at row 70 of episode 2; it is replayed without"],
+        ["the clock 'time.wall' jumps by -30 s at row 70 of episode 2; it is replayed without"],
     ]
     assert all(row["readable"] for row in rows)
 

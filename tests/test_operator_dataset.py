@@ -172,9 +172,20 @@ def test_clock_that_is_set_loses_no_time_and_no_row(sets, caplog) -> None:
     assert recording.t == pytest.approx(np.arange(LENGTH) / FPS)
     assert [record.args[1] for record in caplog.records] == ["time.wall"] * len(sets)
     assert caplog.records[0].getMessage() == (
-        f"x: time.wall was set by {sets[0][1] / 1e9:+.6g} s at row {sets[0][0]} of what the "
-        "operator drove; it is replayed without this jump."
+        f"x: time.wall jumps by {sets[0][1] / 1e9:+.6g} s at row {sets[0][0]} of what the "
+        "operator drove; it is replayed without."
     )
+
+
+def test_pause_in_which_the_person_moves_is_no_jump() -> None:
+    """A recorder that was held up for two seconds: the hand had the time to go elsewhere."""
+    wrist = make_columns()["operator.left_wrist"].copy()
+    wrist[10:, 1] += 0.5
+    changed = {"time.sim": np.zeros((LENGTH, 1)), "operator.left_wrist": wrist}
+    for by, expected in ((2_000_000_000, 2.0), (HOUR, 0.0), (-HOUR, 0.0)):
+        columns = make_columns(**changed, **{"time.wall": set_wall((10, by))})
+        recording, _ = make_dataset_recording(columns, {}, "x", FPS)
+        assert recording.duration == pytest.approx((LENGTH - 1) / FPS + expected)
 
 
 def test_single_wrong_stamp_costs_its_row_alone(caplog) -> None:

@@ -39,6 +39,8 @@ without a clock of its own the first stands still."""
 OPTIONAL_COLUMNS = (ENGAGED_COLUMN, "action", *CLOCKS)
 _MOST = 0.9
 """Share of the rows in which a clock must go on, and by itself, to be used."""
+_MOVED_M = 0.15
+"""Nobody's head or wrist moves farther from one row to the next [m]."""
 _FAR_OFF = 100.0
 """A clock that is faster or slower than the dataset's rate by this factor counts in other units."""
 
@@ -138,7 +140,7 @@ def make_dataset_recording(
     if len(span) < MIN_SAMPLES:
         raise BadRecording(source, "the operator was engaged in a single row of it")
     ticks = {name: columns[name][span, 0] for name in CLOCKS if name in columns}
-    clock = _choose_clock(ticks, source, fps)
+    clock = _choose_clock(ticks, _find_leaps(columns, span), source, fps)
     if clock is None:
         rate = f" at about {fps:g} Hz" if fps else ""
         tried = ", ".join(ticks) or "(it has none)"
@@ -172,18 +174,31 @@ def _is_pose(poses: np.ndarray) -> np.ndarray:
         return np.isfinite(poses).all(axis=1) & (np.abs(norm - 1) <= NORM_TOLERANCE)
 
 
+def _find_leaps(columns: Mapping[str, np.ndarray], span: np.ndarray) -> np.ndarray:
+    """Find the rows in which a limb is elsewhere than in the row before. Shape (n,), bool."""
+    leaps = np.zeros(len(span), bool)
+    tracked = columns["operator.tracked"][span] > 0
+    for limb, frame in enumerate(FRAMES):
+        place = np.asarray(columns[f"operator.{frame}"][span, :3], float)
+        seen = tracked[1:, limb] & tracked[:-1, limb]
+        with np.errstate(invalid="ignore"):
+            leaps[1:] |= seen & (np.linalg.norm(np.diff(place, axis=0), axis=1) > _MOVED_M)
+    return leaps
+
+
 def _choose_clock(
-    clocks: Mapping[str, np.ndarray], source: object, fps: float | None
+    clocks: Mapping[str, np.ndarray], moved: np.ndarray, source: object, fps: float | None
 ) -> RowClock | None:
     """Choose the best clock that runs, at about the rate of the rows; None if there is none.
 
     Args:
         clocks: Columns of `CLOCKS`. Shapes (n,).
+        moved: Whether the person is elsewhere than in the row before. Shape (n,), bool.
         source: What they came from, for the log.
         fps: Rows a second [Hz], if known.
     """
     for name, ticks in clocks.items():
-        clock = read_row_clock(ticks, CLOCKS[name])
+        clock = read_row_clock(ticks, CLOCKS[name], moved)
         count = int(clock.goes_on.sum())
         if count - len(clock.jumps) < max(2, _MOST * len(ticks)):
             continue
@@ -191,8 +206,8 @@ def _choose_clock(
             continue
         for row, seconds in clock.jumps:
             logger.warning(
-                "%s: %s was set by %+.6g s at row %d of what the operator drove; it is replayed "
-                "without this jump.", source, name, seconds, row,
+                "%s: %s jumps by %+.6g s at row %d of what the operator drove; it is replayed "
+                "without.", source, name, seconds, row,
             )  # fmt: skip
         return clock
     return None

@@ -7,7 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 LONGEST_PAUSE_S = 1.0
-"""No recorder is held up for longer between two rows; a clock that goes on by more was set [s]."""
+"""A recorder is rarely held up for longer between two rows; a clock that goes on by more was set,
+unless the person has moved meanwhile [s]."""
+LONGEST_HOLD_S = 60.0
+"""A recorder is never held up for longer [s]."""
 
 
 class RowClock(NamedTuple):
@@ -25,17 +28,22 @@ class RowClock(NamedTuple):
     jumps: tuple[tuple[int, float], ...] = ()
 
 
-def read_row_clock(ticks: np.ndarray, unit: float = 1.0) -> RowClock:
+def read_row_clock(
+    ticks: np.ndarray, unit: float = 1.0, moved: np.ndarray | None = None
+) -> RowClock:
     """Read a clock without the jumps that it makes when somebody sets it.
 
     A board without a battery begins in 1970 until the network tells the time, and an hour that is
     wrong is set right: from one row to the next the clock goes back, or on by more than any
-    recorder is held up, and runs on from there. Such a step is taken for a usual one. A single
-    row whose stamp is wrong, or with which the clock stands still, has no time instead.
+    recorder is held up, and runs on from there. Such a step is taken for a usual one. But where
+    the person is elsewhere after it, they had the time to go there, and it stays. A single row
+    whose stamp is wrong, or with which the clock stands still, has no time instead.
 
     Args:
         ticks: What the clock shows. Shape (n,).
         unit: Seconds that one tick is.
+        moved: Whether the person is elsewhere than in the row before, farther than anybody moves
+            from one row to the next. Shape (n,), bool; nowhere if None.
     """
     # Whole nanoseconds since 1970 are too many for a float: from the first on they are not.
     first = ticks[np.isfinite(ticks)][:1]
@@ -57,7 +65,8 @@ def read_row_clock(ticks: np.ndarray, unit: float = 1.0) -> RowClock:
         # However long it stood still before, the rows say how much time has passed.
         expected = (row - last) * usual
         step = t[row] + shift - t[last]
-        if not 0 < step <= expected + LONGEST_PAUSE_S:
+        pause = LONGEST_HOLD_S if moved is not None and moved[row] else LONGEST_PAUSE_S
+        if not 0 < step <= expected + pause:
             follows = row + 1 < len(t) and 0 < t[row + 1] - t[row] <= longest
             after = t[row + 1] + shift - t[last] if follows else 0.0
             if not follows or 0 < after <= expected + longest:  # a single stamp is wrong
