@@ -83,6 +83,8 @@ def rewrite(path: Path, columns: Mapping[str, Any], drop: tuple[str, ...] = ()) 
 
 
 CAMERA = "observation.images.cam"
+EVERY = 3
+"""Of how many rows one is looked at."""
 
 
 def make_numbered(root: Path, lengths: tuple[int, ...], *, one_file: bool = False) -> Path:
@@ -114,7 +116,7 @@ def make_numbered(root: Path, lengths: tuple[int, ...], *, one_file: bool = Fals
 
 
 def read_numbers(root: Path) -> list[tuple[int, int]]:
-    """The number of each row, and that of its picture as LeRobot shows it, of `make_numbered`."""
+    """The numbers of rows, and of their pictures as LeRobot shows them, of `make_numbered`."""
     dataset = LeRobotDataset("local/numbered", root=root)
-    rows: list[Any] = [dataset[index] for index in range(len(dataset))]
+    rows: list[Any] = [dataset[index] for index in range(0, len(dataset), EVERY)]
     return [(int(row["action"][0]), round(float(row[CAMERA].mean()) * 255 / 4)) for row in rows]
