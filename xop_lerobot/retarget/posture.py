@@ -14,11 +14,14 @@ from xop_lerobot.retarget.linearisation import Placement
 from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights, Solution
 from xop_lerobot.retarget.static_load import StaticLoad
 from xop_lerobot.transforms import (
+    compute_heading,
     compute_heading_squares,
     make_pose,
+    pose_inverse,
     pose_multiply,
     quat_from_yaw,
     quat_yaw,
+    rotation_error,
     sum_squares,
 )
 
@@ -28,7 +31,8 @@ _COUNT = 1000  # postures that are drawn at first
 MISSED = 4e-4  # cost from which a goal counts as missed, and others are tried: 2 cm
 _BETTER, _SHARE = 4e-4, 0.8  # by which, and to what share, another posture must be cheaper
 _PERIOD = 25  # solves after which another start is tried though nothing is missed
-_NEARBY, _OTHER = 6, 12  # iterations from the last posture, and from elsewhere
+_MOVED, _TURNED = 0.01, 0.03  # by which a goal has to move to be looked at anew [m], [rad]
+_NEARBY, _OTHER = 4, 12  # iterations from the last posture, and from elsewhere
 _STARTS = 7  # starts that are tried in turn; odd: each within the limits, then beyond
 _FAR = 0.12  # distance of a posture from which on the way there is looked at, of scale
 _ARRIVED = 0.05  # distance at which a detour has come to its end
@@ -95,12 +99,16 @@ class Repertoire:
 
         Shapes (7,), (7,) -> (n, k).
         """
-        place = make_pose([*base[:2], 0.0], quat_from_yaw(quat_yaw(base[3:])))
-        poses = pose_multiply(place, self._poses)
+        poses = pose_multiply(make_level(base), self._poses)
         error = sum_squares((poses[:, :3] - goal[:3]) * weights.position)
         turn, tilt = compute_heading_squares(goal[3:], poses[:, 3:])
         error += weights.orientation[2] ** 2 * turn + weights.orientation[0] ** 2 * tilt
         return self._commands[np.argsort(error)[:count]]
+
+
+def make_level(base: np.ndarray) -> np.ndarray:
+    """Place on the ground and heading of a base. Shape (7,)."""
+    return make_pose([*base[:2], 0.0], quat_from_yaw(quat_yaw(base[3:])))
 
 
 class PostureSearch:
@@ -119,6 +127,7 @@ class PostureSearch:
         used: Entries that make the posture; the others stay neutral. Shape (k,), bool.
         limits: Bounds within which a posture is looked for. Shapes (k,).
         strict: Whether it stays within them even where a goal can be reached beyond them alone.
+        looks_at_way: Whether it tells detours.
     """
 
     def __init__(
@@ -129,18 +138,20 @@ class PostureSearch:
         limits: tuple[np.ndarray, np.ndarray],
         *,
         strict: bool = False,
+        looks_at_way: bool = True,
     ) -> None:
         self.problem, self._repertoire, self._used = problem, repertoire, used
         self.space = problem.command_model.space
         self._limits = tuple(self.space.restrict(each, Mode.STATIONARY) for each in limits)
-        self._strict = strict
-        self._heeded = used & ~problem.command_model.is_velocity()
+        self._strict, self._looks_at_way = strict, looks_at_way
         self.reset()
 
     def reset(self) -> None:
         """Forget the last solution."""
         self._last: np.ndarray | None = None
-        self._turn = self._quiet = 0
+        self._turn = self._quiet = self._tries = 0
+        self._noted: np.ndarray | None = None
+        self._found = Found(np.zeros(0), np.inf, detour=False)
         self._beyond = self._detours = False
         self._left, self._waited = np.inf, 0
 
@@ -163,6 +174,16 @@ class PostureSearch:
             offset: As for `CommandModel.extrapolate`. Shape (k,).
             settled: As for `CommandModel.extrapolate`. Shape (k,).
         """
+        free = self._used & self.problem.command_model.acting(Mode.STATIONARY)
+        moved = self._note(qpos, goal)
+        apart = self._compute_apart(executed)
+        is_close = apart <= _FAR or not self._looks_at_way
+        if not moved and is_close and not self._detours and self._last is not None:
+            # A few solves are enough for a goal that stays, whether it is met or out of reach.
+            rests = self._found.missed <= MISSED or self._tries >= 2 * _STARTS
+            self._quiet += 1
+            if rests and self._quiet < _PERIOD:
+                return self._found
         low, high = self._limits
         everywhere = (self.space.low, self.space.high)
 
@@ -175,7 +196,7 @@ class PostureSearch:
                 Mode.STATIONARY,
                 AT_REST_S,
                 start=start,
-                free=self._used & self.problem.command_model.acting(Mode.STATIONARY),
+                free=free,
                 offset=offset,
                 settled=settled,
                 bounds=bounds,
@@ -187,18 +208,18 @@ class PostureSearch:
         if self._beyond and best.missed > MISSED:  # there is no need to be beyond
             self._beyond = False
             best = solve(start, _OTHER, self._limits)
-        self._quiet += 1
         if best.missed > MISSED or self._quiet >= _PERIOD:
             self._quiet = 0
+            self._tries += 1
             beyond = not self._strict and best.missed > MISSED and self._turn % 2 == 1
             start = self._choose_start(qpos, goal, executed)
             other = solve(start, _OTHER, everywhere if beyond else self._limits)
             better = other.cost < _SHARE * best.cost - _BETTER
             if better and (not beyond or other.missed <= MISSED):
                 best, self._beyond = other, beyond
-        apart = np.abs(best.command - executed)[self._heeded] / self.problem.scale[self._heeded]
-        left = float(apart.max(initial=0.0))
-        if left <= _FAR:
+        self._last = best.command
+        left = self._compute_apart(executed)
+        if left <= _FAR or not self._looks_at_way:
             self._detours = self._detours and left > _ARRIVED
         else:
             near = solve(executed, _OTHER, (np.minimum(low, executed), np.maximum(high, executed)))
@@ -208,7 +229,31 @@ class PostureSearch:
             if not elsewhere and (inside or (near.missed <= MISSED and not self._strict)):
                 best, self._beyond = near, not inside
         self._last = best.command
-        return Found(best.command, best.missed, self._detours)
+        self._found = Found(best.command, best.missed, self._detours)
+        return self._found
+
+    def _compute_apart(self, executed: np.ndarray) -> float:
+        """Largest distance of the posture executed from the last one found, of scale."""
+        if self._last is None:
+            return np.inf
+        model = self.problem.command_model
+        heeded = self._used & model.acting(Mode.STATIONARY) & ~model.is_velocity()
+        apart = np.abs(self._last - executed)[heeded] / self.problem.scale[heeded]
+        return float(apart.max(initial=0.0))
+
+    def _note(self, qpos: np.ndarray, goal: np.ndarray) -> bool:
+        """Whether a goal has moved, as far as it counts, on the base; if so take note of it."""
+        weights, base = self.problem.weights, make_level(qpos[:7])
+        if not weights.orientation[2]:
+            base = make_pose(base[:3], quat_from_yaw(compute_heading(goal[3:])))
+        place = pose_multiply(pose_inverse(base), goal)
+        if self._noted is not None:
+            away = (place[:3] - self._noted[:3])[np.array(weights.position) > 0]
+            turned = np.linalg.norm(rotation_error(place[3:], self._noted[3:]))
+            if np.linalg.norm(away) < _MOVED and turned < _TURNED:
+                return False
+        self._noted, self._tries = place, 0
+        return True
 
     def _is_stuck(self, left: float, now: Solution) -> bool:
         """Whether a robot that misses its goal has not come nearer to the posture for a while."""

@@ -130,18 +130,27 @@ class PostureGuide:
         if HEAD not in sites:
             return
         still = configs[Mode.STATIONARY]
-        self._searches[Mode.STATIONARY] = self._make_search(still, level=False)
+        # A chain of many joints has several postures for a goal; a waist on legs has one.
+        chain = self._morphology.has_stiff_body
+        self._searches[Mode.STATIONARY] = self._make_search(still, level=False, way=chain)
         self._free = self._make_search(still, level=False)
         self._level = self._make_search(still, level=True)
         if self._command_model.is_nonholonomic:
             self._searches[Mode.MOBILE] = self._make_search(
-                configs[Mode.MOBILE], level=True, upright=True
+                configs[Mode.MOBILE], level=True, upright=True, way=chain
             )
 
     def _make_search(
-        self, config: MpcConfig, *, level: bool, upright: bool = False
+        self, config: MpcConfig, *, level: bool, upright: bool = False, way: bool = False
     ) -> PostureSearch:
-        """Make a search: for height and tilt alone where it is `level`; without a lean aside."""
+        """Make a search.
+
+        Args:
+            config: Whose weights it takes.
+            level: Whether it is for height and tilt alone.
+            upright: Whether it does without a lean aside.
+            way: Whether it looks at the way to the posture.
+        """
         weights = make_proposal_weights(config.weights)
         used = np.ones(len(self._vertical), dtype=bool)
         weights = dataclasses.replace(weights, effort=_EFFORT, change=0.0, lean=0.0)
@@ -163,7 +172,9 @@ class PostureGuide:
             self._morphology.base_body,
             self.load,
         )
-        return PostureSearch(problem, self._repertoire, used, self._limits, strict=level)
+        return PostureSearch(
+            problem, self._repertoire, used, self._limits, strict=level, looks_at_way=way
+        )
 
     def reset(self) -> None:
         """Start anew."""
