@@ -64,7 +64,7 @@ class CostWeights:
     fall: float = 100.0
     support: float = 1000.0
     lean: float = 0.0
-    load: float = 10.0
+    load: float = 100.0
     lateral: float = 0.0
 
 

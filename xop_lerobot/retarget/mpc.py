@@ -331,7 +331,7 @@ class MpcRetargeter(Retargeter):
         if HEAD not in self.sites or HEAD not in goal.poses:
             return goal, None
         offset, settled = self.offset.offset, self.offset.settled
-        goal = self._postures.hold(goal, qpos, executed, offset, settled)
+        goal = self._postures.hold(goal, qpos, executed, offset, settled, config.preview_s)
         then = preview(goal, (HEAD,), np.array([config.proposal_s]), config.preview_s)[HEAD][0]
         return goal, self._postures.find(goal, then, qpos, executed, offset, settled)
 

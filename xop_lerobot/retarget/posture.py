@@ -66,6 +66,10 @@ class Repertoire:
         base_body: The robot's root body.
         support: Area over which the centre of mass stays; None for one that balances itself.
         load: What joints bear of the weight above them.
+
+    Attributes:
+        commands: The commands that hold them. Shape (n, k).
+        poses: Poses of the head in them. Shape (n, 7).
     """
 
     def __init__(
@@ -90,7 +94,7 @@ class Repertoire:
             held &= (support.compute_excess(qpos[:, :7], com[:, :2]) <= 0).all(axis=-1)
         if load is not None:
             held &= (load.compute_excess(qpos) <= 0).all(axis=-1)
-        self._commands, self._poses = commands[held], poses[site][held]
+        self.commands, self.poses = commands[held], poses[site][held]
 
     def choose(
         self, base: np.ndarray, goal: np.ndarray, weights: ProposalWeights, count: int
@@ -99,11 +103,11 @@ class Repertoire:
 
         Shapes (7,), (7,) -> (n, k).
         """
-        poses = pose_multiply(make_level(base), self._poses)
+        poses = pose_multiply(make_level(base), self.poses)
         error = sum_squares((poses[:, :3] - goal[:3]) * weights.position)
         turn, tilt = compute_heading_squares(goal[3:], poses[:, 3:])
         error += weights.orientation[2] ** 2 * turn + weights.orientation[0] ** 2 * tilt
-        return self._commands[np.argsort(error)[:count]]
+        return self.commands[np.argsort(error)[:count]]
 
 
 def make_level(base: np.ndarray) -> np.ndarray:
@@ -143,6 +147,8 @@ class PostureSearch:
         self.problem, self._repertoire, self._used = problem, repertoire, used
         self.space = problem.command_model.space
         self._limits = tuple(self.space.restrict(each, Mode.STATIONARY) for each in limits)
+        whole = (self.space.low, self.space.high)
+        self._everywhere = tuple(self.space.restrict(each, Mode.STATIONARY) for each in whole)
         self._strict, self._looks_at_way = strict, looks_at_way
         self.reset()
 
@@ -180,12 +186,12 @@ class PostureSearch:
         is_close = apart <= _FAR or not self._looks_at_way
         if not moved and is_close and not self._detours and self._last is not None:
             # A few solves are enough for a goal that stays, whether it is met or out of reach.
-            rests = self._found.missed <= MISSED or self._tries >= 2 * _STARTS
+            rests = self._found.missed <= MISSED or self._tries >= 4 * _STARTS
             self._quiet += 1
             if rests and self._quiet < _PERIOD:
                 return self._found
         low, high = self._limits
-        everywhere = (self.space.low, self.space.high)
+        everywhere = self._everywhere
 
         def solve(
             start: np.ndarray, iterations: int, bounds: tuple[np.ndarray, np.ndarray]
@@ -270,6 +276,6 @@ class PostureSearch:
             return executed
         if turn == 1:
             return self.space.neutral
-        count = _STARTS - 2
-        starts = self._repertoire.choose(qpos[:7], goal, self.problem.weights, count)
-        return starts[(turn - 2) % len(starts)]
+        count, second = _STARTS - 2, self._turn // _STARTS % 2
+        starts = self._repertoire.choose(qpos[:7], goal, self.problem.weights, 2 * count)
+        return starts[(second * count + turn - 2) % len(starts)]

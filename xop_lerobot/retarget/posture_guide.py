@@ -37,6 +37,7 @@ _EFFORT, _LEVEL_EFFORT = 0.002, 0.01  # of a posture, which has all the time to 
 _NEAR, _SAME = 0.01, 0.03  # by which a goal may be missed before it is moved [m], [rad]
 _EXTEND = 0.02  # by which the reach of a robot that stands changes in a solve [m]
 _FARTHEST = 1.0  # its largest [m]
+_STILL = 0.1  # speed of a goal under which it counts as standing still [m/s]
 _CREEP = 0.02  # speed that counts as none [m/s], [rad/s]
 _BEYOND = 0.6  # turn past half a turn at which the other way round is taken [rad]
 
@@ -193,6 +194,7 @@ class PostureGuide:
         executed: np.ndarray,
         offset: np.ndarray,
         settled: np.ndarray,
+        preview_s: float,
     ) -> Goal:
         """Hold the goal of a robot that stands near the place where its head rests.
 
@@ -202,6 +204,7 @@ class PostureGuide:
             executed: Decision executed now. Shape (n,).
             offset: As for `CommandModel.extrapolate`. Shape (n,).
             settled: As for `CommandModel.extrapolate`. Shape (n,).
+            preview_s: Time over which it is assumed to keep its velocity [s].
         """
         if (
             self._level is None
@@ -217,22 +220,29 @@ class PostureGuide:
         axes = np.stack([ahead, [-ahead[1], ahead[0]]])
         place = axes @ (pose[:2] - qpos[:2])
         beyond = self._compute_turn_beyond(pose[3:], heading)
-        is_far = math.dist(place, self._resting) > self._morphology.standing_reach
+        velocity = goal.velocities.get(HEAD, np.zeros(6))
+        end = place + preview_s * (axes @ velocity[:2])  # where it is led to
+        far = max(math.dist(each, self._resting) for each in (place, end))
+        is_far = far > self._morphology.standing_reach
         reachable = False
         if beyond or is_far:
             reachable = self._free.find(HEAD, qpos, pose, *arguments).missed <= MISSED
         if beyond and not reachable:  # a tilted head may look further aside than the waist turns
             pose[3:] = quat_multiply(quat_from_yaw(-beyond), pose[3:])
             reachable = self._free.find(HEAD, qpos, pose, *arguments).missed <= MISSED
-        self._adapt_reach(reachable and is_far)
+        self._adapt_reach(reachable and is_far, moving=_is_moving(goal))
         if is_far:
             # Who bows or squats has the head elsewhere; up to there it is no matter of reach.
             found = self._level.find(HEAD, qpos, pose, *arguments)
             bowed, _ = self._place(qpos, found.command, offset, settled)
             bowed = axes @ (bowed[:2] - qpos[:2])
-            place = _hold_near_line(place, self._resting, bowed, self._reach)
+            place, end = (
+                _hold_near_line(each, self._resting, bowed, self._reach) for each in (place, end)
+            )
             pose[:2] = qpos[:2] + place @ axes
-        return dataclasses.replace(goal, poses={**goal.poses, HEAD: pose})
+            velocity = np.array([*((end - place) @ axes / max(preview_s, 1e-6)), *velocity[2:]])
+        velocities = {**goal.velocities, HEAD: velocity}
+        return dataclasses.replace(goal, poses={**goal.poses, HEAD: pose}, velocities=velocities)
 
     def _is_braking(self, executed: np.ndarray) -> bool:
         """Whether more is executed than what sways a robot that stands."""
@@ -240,10 +250,10 @@ class PostureGuide:
         twist = self._command_model.compute_twist(executed)
         return bool((np.abs(twist) > sway + _CREEP).any())
 
-    def _adapt_reach(self, reachable: bool) -> None:
+    def _adapt_reach(self, reachable: bool, *, moving: bool) -> None:
         """Let the goal go further off where the robot can be there, and take it back where not."""
         least = self._morphology.standing_reach
-        change = _EXTEND if reachable else -_EXTEND
+        change = (0.0 if moving else _EXTEND) if reachable else -_EXTEND
         self._reach = min(max(self._reach + change, least), _FARTHEST)
 
     def _compute_turn_beyond(self, quat: np.ndarray, base: float) -> float:
@@ -333,6 +343,12 @@ def make_static_load(morphology: Morphology, model: mujoco.MjModel) -> StaticLoa
         return None
     joints = [effect.joint for effect in morphology.effects if effect.joint]
     return StaticLoad(model, joints, morphology.load_share)
+
+
+def _is_moving(goal: Goal) -> bool:
+    """Whether the goal of the head is on its way somewhere."""
+    velocity = goal.velocities.get(HEAD)
+    return velocity is not None and math.hypot(velocity[0], velocity[1]) > _STILL
 
 
 def _remove_roll(pose: np.ndarray) -> np.ndarray:

@@ -1,0 +1,152 @@
+"""Drive robots to random reachable goals of the head in simulation, and tell which they miss.
+
+    python scripts/check_postures.py --robot rby1 --goals 20
+    python scripts/check_postures.py --robot g1 --goals 10 --noise mild
+
+Goals are made from postures that the robot can hold, so each can be reached; the robot goes from
+each to the next in stationary mode. The tests do the same with the kinematic proposal alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.evaluation.tracking import WorldAlignment
+from xop_lerobot.link import RobotInfo
+from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.operator.device import Device
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.plant.config import SimulationConfig
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.retarget.mpc import MpcRetargeter
+from xop_lerobot.retarget.posture import Repertoire
+from xop_lerobot.retarget.posture_guide import make_static_load
+from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+from xop_lerobot.transforms import (
+    compute_heading,
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_from_yaw,
+    rotation_error,
+)
+
+NEAR_M, NEAR_DEG = 0.05, 5.0
+LOWEST, MOST_TILTED = 0.5, 100.0
+"""Goals lower [m] or more tilted [deg] are nobody's head's."""
+
+
+class Head(Device):
+    """A head that is where it is put; its hands go with it.
+
+    Args:
+        head: Where it is at first. Shape (7,).
+        wrists: Where the wrists are then. Shapes (7,).
+    """
+
+    self_engaging = True
+    start_mode = Mode.STATIONARY
+
+    def __init__(self, head: np.ndarray, wrists: dict[str, np.ndarray]) -> None:
+        self.head = head
+        level = pose_inverse(_level(head))
+        self._from_head = {name: pose_multiply(level, pose) for name, pose in wrists.items()}
+
+    def start(self, time: float) -> None:
+        """Nothing begins."""
+
+    def read(self, time: float) -> OperatorFrame:
+        """The head where it is, and the hands as they hang on it."""
+        wrists = {name: pose_multiply(_level(self.head), p) for name, p in self._from_head.items()}
+        return OperatorFrame(
+            time=time, head=self.head, **wrists, pinch=np.full(2, 0.1), mode=self.start_mode
+        )
+
+
+def _level(pose: np.ndarray) -> np.ndarray:
+    return make_pose(pose[:3], quat_from_yaw(compute_heading(pose[3:])))
+
+
+def draw_goals(retargeter: MpcRetargeter, count: int, seed: int) -> np.ndarray:
+    """Draw poses of the head in postures that the robot can hold. Shape (count, 7)."""
+    morphology, model = retargeter.morphology, retargeter.rollout.model
+    repertoire = Repertoire(
+        model,
+        retargeter.command_model,
+        morphology.standing_qpos(),
+        morphology.frames["head"],
+        morphology.base_body,
+        retargeter.support,
+        make_static_load(morphology, model),
+    )
+    poses = repertoire.poses
+    upright = 1 - 2 * np.square(poses[:, 4:6]).sum(axis=1)
+    kept = poses[(poses[:, 2] > LOWEST) & (upright > np.cos(np.radians(MOST_TILTED)))]
+    return np.random.default_rng(seed).permutation(kept)[:count]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the check; 1 if a goal is missed or the robot falls."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--robot", default="rby1", help="g1 or rby1 (default: rby1)")
+    parser.add_argument("--goals", type=int, default=20, help="number of goals (default: 20)")
+    parser.add_argument("--hold", type=float, default=6.0, help="time for each [s] (default: 6)")
+    parser.add_argument("--noise", default="off", help="sensor noise (default: off)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the goals (default: 0)")
+    args = parser.parse_args(arguments)
+
+    morphology = make_morphology(args.robot)
+    low_level = morphology.policies[0]
+    plant = Simulation(morphology, SimulationConfig(noise=args.noise, seed=args.seed))
+    loop = PolicyLoop(morphology, plant, make_policy(low_level))
+    info = RobotInfo(args.robot, morphology, low_level, None, SimulationConfig().scene, 25, 0)
+    config = TeleoperationConfig(retargeter=RetargeterConfig(threads=1))
+    teleoperation = Teleoperation(config, info)
+    loop.reset(args.seed)
+    retargeter = teleoperation.retargeter
+    assert isinstance(retargeter, MpcRetargeter)
+
+    def measure() -> dict[str, np.ndarray]:
+        return retargeter.readings.compute_poses(loop.state.true_qpos, morphology.frames)
+
+    frames = measure()
+    head = frames.pop("head")
+    device = teleoperation.device = Head(head, frames)
+    teleoperation.alignment = WorldAlignment()
+    teleoperation.reset()
+    missed = 0
+    for i, goal in enumerate(draw_goals(retargeter, args.goals, args.seed)):
+        device.head = goal
+        for _ in range(round(args.hold * info.fps)):
+            action, _ = teleoperation.step(loop.state)
+            loop.execute(action, 1 / info.fps)
+        reached = measure()["head"]
+        away = float(np.linalg.norm(reached[:3] - goal[:3]))
+        turned = float(np.degrees(np.linalg.norm(rotation_error(goal[3:], reached[3:]))))
+        failed = away > NEAR_M or turned > NEAR_DEG
+        missed += failed
+        verdict = "missed" if failed else "reached"
+        print(f"goal {i}: {verdict}, {away * 100:.1f} cm and {turned:.1f} deg away", flush=True)
+        if loop.state.fallen:
+            print("the robot has fallen")
+            break
+    print(f"{args.robot}: {missed} of {args.goals} goals missed")
+    teleoperation.disconnect()
+    loop.close()
+    return 1 if missed or loop.state.fallen else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
