@@ -117,8 +117,9 @@ class Morphology(ABC):
     posture_limits: Mapping[str, tuple[float, float]] = {}
     """Angles within which joints of the command are kept [rad] wherever a goal does not need
     more, by entry: the knees that it is to bend."""
-    load_share: float = 0.85
-    """Share of its largest torque that a joint of a stiff body may need to hold a posture [1]."""
+    load_share: float = 0.75
+    """Share of its largest torque that a joint of a stiff body may need to hold a posture [1]; the
+    rest is for moving there."""
     standing_reach: float = 0.3
     """How far from where it rests the head of a robot that stands is led [m]."""
 

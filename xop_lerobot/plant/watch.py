@@ -32,7 +32,7 @@ SPEED = 0.3
 """Mean speed at which it moves all the same [m/s]. Policies step on the spot and drift a bit."""
 SPAN_S = 0.5
 """Time over which that mean is taken [s]."""
-GAP_S = 0.1
+GAP_S = 0.3
 """Time for which a servo may be behind its target by more than the robot's `servo_gap` [s]."""
 CALM_S = 1.0
 """Time without any of this after which the trouble is over [s]."""
