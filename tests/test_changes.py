@@ -264,7 +264,8 @@ def test_thousands_of_changes_are_one_tick_of_work(rig, caplog):  # noqa: F811
     assert record.settings["weights"] == {"position": 600.0}
     assert len(configured) == 1
     assert r.teleop._board._count == posted + 2
-    assert caplog.messages == ["Mode: stationary.", "Weight position 600."]
+    told = [each.getMessage() for each in caplog.records if each.name.endswith(".display")]
+    assert told == ["Mode: stationary.", "Weight position 600."]
 
 
 def test_the_direct_baseline_has_a_mode_only():

@@ -151,6 +151,7 @@ def test_new_weights_act_at_the_next_plan(bench):
     goal = bench.make_goal((0.4, 0, 0))
     bench.tick(goal)
     state = bench.loop.state
+    bench.retargeter.configure(bench.weigh(position=1.0, orientation=0.0, tilt_share=0.0))
     bench.retargeter.reset(state)
     plan = bench.retargeter.plan(state, goal)
     bench.retargeter.configure(bench.weigh(position=3.0, orientation=0.0, tilt_share=0.0))
