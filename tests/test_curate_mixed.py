@@ -69,7 +69,7 @@ def test_figures_tell_the_kinds(session, kinds, capsys):
         assert row["fall"] is row["collision"] is (kind == "fall"), kind
         assert row["gaps"] == (kind == "tracking_loss"), kind
         assert (row["gap_time"] == pytest.approx(0.8, abs=0.1)) is (kind == "tracking_loss"), kind
-        assert (row["tracking_p95"] > 0.5) is (kind == "fall"), kind
+        assert row["trouble"] is (kind == "fall"), kind
         assert row["tracking_p95"] < 1.5
         assert (row["command_roughness"] < 1.5) is (kind == "failure"), kind
         assert row["robot"] == "xop_g1"
@@ -92,7 +92,7 @@ def test_figures_tell_the_kinds(session, kinds, capsys):
         ("gaps > 0", {"tracking_loss"}),
         ("success and idle_start + idle_end < 1", {"success"}),
         ("not success and not fall and gaps == 0", {"failure"}),
-        ("tracking_p95 > 0.5 or gap_max > 0.5", {"fall", "tracking_loss"}),
+        ("trouble or gap_max > 0.5", {"fall", "tracking_loss"}),
     ],
 )
 def test_filters_choose_kinds(session, kinds, capsys, where, expected):

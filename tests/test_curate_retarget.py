@@ -330,7 +330,7 @@ def test_nothing_that_can_be_replayed(source, tmp_path, capsys):
     assert retarget(root, tmp_path / "out", "--workers=1") == 1
     error = capsys.readouterr().err.splitlines()
     assert error[-1] == "error: no operator could be replayed, so no dataset is made"
-    assert "no clock of it runs. Tried: time.sim, time.wall, timestamp" in error[-2]
+    assert "no clock of it runs at about 25 Hz. Tried: time.sim, time.wall, timestamp" in error[-2]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["toys"]
 
 

