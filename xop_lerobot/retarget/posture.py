@@ -29,7 +29,7 @@ AT_REST_S = 20.0
 """Time after which a robot has taken a command up, whatever its lags [s]."""
 _COUNT = 1000  # postures that are drawn at first
 MISSED = 4e-4  # cost from which a goal counts as missed, and others are tried: 2 cm
-_BETTER, _SHARE = 4e-4, 0.8  # by which, and to what share, another posture must be cheaper
+_BETTER, _SHARE = 4e-4, 0.95  # by which, and to what share, another posture must be cheaper
 _PERIOD = 25  # solves after which another start is tried though nothing is missed
 _MOVED, _TURNED = 0.01, 0.03  # by which a goal has to move to be looked at anew [m], [rad]
 _NEARBY, _OTHER = 4, 12  # iterations from the last posture, and from elsewhere

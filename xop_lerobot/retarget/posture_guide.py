@@ -38,6 +38,7 @@ _NEAR, _SAME = 0.01, 0.03  # by which a goal may be missed before it is moved [m
 _EXTEND = 0.02  # by which the reach of a robot that stands changes in a solve [m]
 _FARTHEST = 1.0  # its largest [m]
 _STILL = 0.1  # speed of a goal under which it counts as standing still [m/s]
+_OFF, _PATIENCE = 0.06, 25  # error of the height [m], and solves, from which a robot is stuck
 _CREEP = 0.02  # speed that counts as none [m/s], [rad/s]
 _BEYOND = 0.6  # turn past half a turn at which the other way round is taken [rad]
 
@@ -185,7 +186,7 @@ class PostureGuide:
         self._start()
 
     def _start(self) -> None:
-        self._beside, self._reach = 0.0, self._morphology.standing_reach
+        self._beside, self._reach, self._waited = 0.0, self._morphology.standing_reach, 0
 
     def hold(
         self,
@@ -250,6 +251,16 @@ class PostureGuide:
         twist = self._command_model.compute_twist(executed)
         return bool((np.abs(twist) > sway + _CREEP).any())
 
+    def _is_stuck(self, goal: Goal, qpos: np.ndarray) -> bool:
+        """Whether a robot that drives stays above or below a goal that stands, from then on."""
+        if _is_moving(goal):
+            self._waited = 0
+        elif self._waited < _PATIENCE:
+            poses, _, _ = self._placement.compute(qpos[None])
+            off = abs(float(poses[self._site][0][2] - goal.poses[HEAD][2]))
+            self._waited = self._waited + 1 if off > _OFF else 0
+        return self._waited >= _PATIENCE
+
     def _adapt_reach(self, reachable: bool, *, moving: bool) -> None:
         """Let the goal go further off where the robot can be there, and take it back where not."""
         least = self._morphology.standing_reach
@@ -294,6 +305,9 @@ class PostureGuide:
         found = search.find(HEAD, qpos, pose, executed, offset, settled)
         if not np.isfinite(found.command).all():
             search.reset()
+            return None
+        # On the way, to be in the posture for the goal of now takes more torque than to follow it.
+        if goal.mode is Mode.MOBILE and not self._is_stuck(goal, qpos):
             return None
         return self._describe(found, goal.mode, pose, qpos, offset, settled)
 
