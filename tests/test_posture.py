@@ -94,7 +94,7 @@ class Robot:
         )
         proposal = self.mpc.candidates.propose(
             make_state(self, qpos, command),
-            {"head": served.move(goals["head"][-1:])},
+            {"head": goals["head"][-1:] if served is None else served.move(goals["head"][-1:])},
             goal.mode,
             config,
             start=command,
