@@ -75,7 +75,7 @@ def test_who_moves_though_told_to_stand_is_noticed_within_half_a_second(name, mo
     walk.command(mode)
     assert walk.run(3.0) is None
     noticed = walk.run(2.0, **motion)
-    assert noticed is not None and noticed <= 0.55
+    assert noticed is not None and noticed <= 0.5
     assert walk.watch.trouble == MOVES == "the robot moves though it is told to stand"
 
 
