@@ -9,11 +9,16 @@ import torch
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import PolicyFileError
-from xop_lerobot.low_level.amo import DEFAULT_POSTURE, FILES, SEEN
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.transforms import quat_from_yaw
 
+FILES = ("amo_jit.pt", "adapter_jit.pt", "adapter_norm_stats.pt")
+SEEN = [*range(19), *range(22, 26)]
+"""Joints that it sees, among the robot's 29: no wrists."""
+DEFAULT_POSTURE = np.array(
+    [-0.1, 0, 0, 0.3, -0.2, 0] * 2 + [0.0] * 3 + [0.5, 0, 0.2, 0.3, 0.5, 0, -0.2, 0.3]
+)
 SIZES = (1043, 25 * 93, 12, 15)
 
 
@@ -142,12 +147,18 @@ def test_it_brings_its_own_motors(folder):
 
 
 def test_files_that_are_missing_or_wrong(tmp_path, folder):
-    with pytest.raises(PolicyFileError, match=r"AMO's amo_jit.pt, adapter_jit.pt, adapter_norm"):
+    with pytest.raises(PolicyFileError, match=r"amo_jit.pt' does not exist. Give AMO's amo_jit.pt"):
         make_policy("amo", str(tmp_path))
     for name in FILES:
         (tmp_path / name).write_bytes((folder / name).read_bytes())
+    with pytest.raises(PolicyFileError, match="AMO has 3 files; give their folder"):
+        make_policy("amo", str(tmp_path / FILES[0]))
     torch.save({"input_mean": np.zeros(3)}, tmp_path / FILES[2])
     with pytest.raises(PolicyFileError, match="holds no arrays input_mean, input_std"):
+        make_policy("amo", str(tmp_path))
+    torch.save({f"{side}_{kind}": np.zeros(n) for side, n in (("input", 3), ("output", 15))
+                for kind in ("mean", "std")}, tmp_path / FILES[2])  # fmt: skip
+    with pytest.raises(PolicyFileError, match="the reference has 3 inputs, and its terms are 12"):
         make_policy("amo", str(tmp_path))
     (tmp_path / FILES[0]).write_bytes(b"nothing")
     with pytest.raises(PolicyFileError, match="amo_jit.pt' is no TorchScript network"):

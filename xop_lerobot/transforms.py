@@ -238,3 +238,20 @@ def _double_angle(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray:
     """Wrap to (-pi, pi] [rad]."""
     return -((-np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def compute_projected_gravity(quat: np.ndarray) -> np.ndarray:
+    r"""Compute the unit gravity vector in the body frame, :math:`R(q)^T (0, 0, -1)^T`.
+
+    Args:
+        quat: Orientation of the base, wxyz. Shape (n, 4).
+
+    Returns:
+        Shape (n, 3).
+    """
+    w, x, y, z = quat.T
+    gravity = np.empty((len(quat), 3))
+    gravity[:, 0] = 2 * (w * y - x * z)
+    gravity[:, 1] = -2 * (w * x + y * z)
+    gravity[:, 2] = 2 * (x * x + y * y) - 1
+    return gravity

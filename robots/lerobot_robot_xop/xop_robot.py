@@ -13,7 +13,7 @@ from lerobot_robot_xop.config_xop import XopG1Config, XopRby1Config, XopRobotCon
 from xop_lerobot.dataset.body import Body
 from xop_lerobot.errors import NotConnected, UnknownName
 from xop_lerobot.link import Executed, RobotInfo, get_session
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.policy import make_policy, resolve_policy
 from xop_lerobot.mistakes import report_mistakes
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_scene_spec
@@ -213,19 +213,6 @@ class XopRobot(Robot):
         if plant is not None:
             plant.close()
         self._session.withdraw(self._info)
-
-
-def resolve_policy(morphology: Morphology, name: str) -> str:
-    """Return the low-level policy that `name` means for this robot.
-
-    Raises:
-        UnknownName: If it does not fit the robot, with those that do.
-    """
-    if name in morphology.policies:
-        return name
-    if name == "default":
-        return morphology.policies[0]
-    raise UnknownName(f"low-level policy of {morphology.name}", name, morphology.policies)
 
 
 def _check_cameras(morphology: Morphology, config: XopRobotConfig) -> None:

@@ -32,7 +32,7 @@ from xop_lerobot.errors import BadValue, UnknownName, XopError
 from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
 from xop_lerobot.evaluation.tracking_scenarios import bend_from, make_curve
 from xop_lerobot.link import RobotInfo
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.low_level.policy import POLICY_DT, make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.goal_velocity import GoalVelocity
 from xop_lerobot.plant.config import NOISE_PRESETS, SimulationConfig
@@ -164,7 +164,7 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
         UnknownName: If a name in `config` is unknown.
     """
     morphology = make_morphology(config.robot)
-    low_level = config.low_level or morphology.policies[0]
+    low_level = resolve_policy(morphology, config.low_level)
     path = config.low_level_path or None
     settings = RetargeterConfig(
         num_samples=config.samples,

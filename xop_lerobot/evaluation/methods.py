@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from xop_lerobot.errors import BadValue, PolicyFileError, UnknownName
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.policy import make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig
 
@@ -122,12 +122,7 @@ def resolve_low_level(morphology: Morphology, method: str, low_level: str = "") 
     Raises:
         UnknownName: If it does not fit the robot, listing those that do.
     """
-    name = get_method(method).low_level or low_level or morphology.policies[0]
-    if name not in morphology.policies:
-        if name == "default":
-            return morphology.policies[0]
-        raise UnknownName(f"low-level policy of {morphology.name}", name, morphology.policies)
-    return name
+    return resolve_policy(morphology, get_method(method).low_level or low_level)
 
 
 def find_absence(low_level: str, path: str = "") -> str:

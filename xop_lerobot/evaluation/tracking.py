@@ -32,7 +32,7 @@ from xop_lerobot.evaluation.tracking_setup import (
     resolve_configs,
 )
 from xop_lerobot.link import RobotInfo
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.policy import make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
@@ -204,7 +204,7 @@ def run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory
     """
     scenario = get_scenario(setup.scenario)
     morphology = make_tuned_morphology(setup)
-    low_level = setup.low_level or morphology.policies[0]
+    low_level = resolve_policy(morphology, setup.low_level)
     path = setup.low_level_path or None
     config = SimulationConfig(scene=scenario.scene, noise=setup.resolved_noise, seed=seed)
     plant = Simulation(morphology, config, model=make_loaded_model(morphology, setup, config.scene))

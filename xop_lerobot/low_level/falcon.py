@@ -11,7 +11,7 @@ from xop_lerobot.low_level.falcon_observation import (
     FalconLikePolicy,
     calm_arms,
 )
-from xop_lerobot.low_level.onnx_network import OnnxNetwork
+from xop_lerobot.low_level.networks import OnnxNetwork
 from xop_lerobot.low_level.policy import POLICIES
 from xop_lerobot.low_level.policy_file import find_falcon_file
 

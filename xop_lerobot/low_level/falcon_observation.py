@@ -33,6 +33,7 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadShape
 from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
+from xop_lerobot.transforms import compute_projected_gravity
 
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 ARM = (
@@ -132,23 +133,6 @@ def calm_arms(observation: np.ndarray) -> np.ndarray:
         Shape (n, 575), float32.
     """
     return observation * CALM_VIEW.astype(np.float32)
-
-
-def compute_projected_gravity(quat: np.ndarray) -> np.ndarray:
-    r"""Compute the unit gravity vector in the body frame, :math:`R(q)^T (0, 0, -1)^T`.
-
-    Args:
-        quat: Orientation of the base, wxyz. Shape (n, 4).
-
-    Returns:
-        Shape (n, 3).
-    """
-    w, x, y, z = quat.T
-    gravity = np.empty((len(quat), 3))
-    gravity[:, 0] = 2 * (w * y - x * z)
-    gravity[:, 1] = -2 * (w * x + y * z)
-    gravity[:, 2] = 2 * (x * x + y * y) - 1
-    return gravity
 
 
 def compute_waist_tilt(command: np.ndarray) -> np.ndarray:

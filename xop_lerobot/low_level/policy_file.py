@@ -1,22 +1,16 @@
-"""Where FALCON's network comes from: a given file, the cache, or its public repository."""
+"""Where a policy's files come from: given, beside their table, in the cache, or downloaded once."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 
 from xop_lerobot.errors import PolicyFileError
+from xop_lerobot.low_level.description import File
 
 logger = logging.getLogger(__name__)
-
-FALCON_REVISION = "b29f11a8cca73919b69b6b3edf889c7f68db30fc"
-FALCON_URL = (
-    f"https://raw.githubusercontent.com/LeCAR-Lab/FALCON/{FALCON_REVISION}"
-    "/sim2real/models/falcon/g1_29dof.onnx"
-)
-FALCON_SHA256 = "8ac8f51875b878a79d9b5782e702b66572697e204ed262e2002b55631f3105d0"
-FALCON_FILE = "falcon_g1_29dof.onnx"
 
 
 def compute_sha256(path: Path) -> str:
@@ -24,78 +18,118 @@ def compute_sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def falcon_cache_path() -> Path:
-    """Return where the downloaded network is kept."""
+def cache_folder() -> Path:
+    """Return where downloaded files are kept."""
     import pooch  # noqa: PLC0415
 
-    return Path(pooch.os_cache("xop-lerobot")) / FALCON_FILE
+    return Path(pooch.os_cache("xop-lerobot"))
 
 
-def find_falcon_file(path: str | None = None) -> Path:
-    """Find FALCON's network: at `path`, else in the cache, else download it.
+@dataclass(frozen=True)
+class FileFinder:
+    """Finds the files of one policy.
 
-    A file given by `path` may have another checksum (one may train one's own); this is
-    logged. The cached and the downloaded file must have the known one.
-
-    Raises:
-        PolicyFileError: If there is no file at `path`; if the cached or downloaded file is
-            altered; if it is absent and cannot be downloaded (names the three ways).
+    Attributes:
+        title: The policy, as messages call it.
+        folder: Folder of its table, where its files may lie too.
+        given: File or folder that the user gives; None for none.
+        num_files: How many files it has; a single one may be given by its own path.
     """
-    if path is not None:
-        return _check_given_file(Path(path).expanduser())
-    cached = falcon_cache_path()
-    if not cached.is_file():
-        return _download(cached)
-    actual = compute_sha256(cached)
-    if actual != FALCON_SHA256:
-        raise PolicyFileError(
-            f"policy file '{cached}' has SHA-256 {actual}, expected {FALCON_SHA256}. "
-            "Delete it, and it will be downloaded again."
+
+    title: str
+    folder: Path
+    given: Path | None
+    num_files: int
+
+    def find(self, file: File) -> Path:
+        """Find one file.
+
+        A file that the user gives may have another checksum (one may train one's own); this is
+        logged. A cached or downloaded file must have the known one.
+
+        Raises:
+            PolicyFileError: If it is not where the user says; if the cached or downloaded file is
+                altered; if it is nowhere and cannot be downloaded (names the ways to provide it).
+        """
+        if self.given is not None:
+            return self._take_given(file, self.given)
+        beside = self.folder / file.name
+        if beside.is_file():
+            self._warn_of_another(beside, file)
+            return beside
+        cached = cache_folder() / file.name
+        if not cached.is_file():
+            return self._download(file, cached)
+        actual = compute_sha256(cached)
+        if file.sha256 is not None and actual != file.sha256:
+            raise PolicyFileError(
+                f"policy file '{cached}' has SHA-256 {actual}, expected {file.sha256}. "
+                "Delete it, and it will be downloaded again."
+            )
+        return cached
+
+    def _take_given(self, file: File, given: Path) -> Path:
+        name = Path(file.name).name
+        path = given / name if given.is_dir() else given
+        if not path.is_file():
+            raise PolicyFileError(
+                f"policy file '{path}' does not exist. Give {self.title}'s {name}, or the folder "
+                "that holds it, with --robot.low_level.path=PATH; without a path the cached or "
+                "downloaded one is used."
+            )
+        if self.num_files > 1 and not given.is_dir():
+            raise PolicyFileError(
+                f"{self.title} has {self.num_files} files; give their folder with "
+                f"--robot.low_level.path=FOLDER, got '{given}'"
+            )
+        self._warn_of_another(path, file)
+        return path
+
+    def _warn_of_another(self, path: Path, file: File) -> None:
+        if file.sha256 is None:
+            return
+        actual = compute_sha256(path)
+        if actual != file.sha256:
+            logger.warning(
+                "policy file '%s' has SHA-256 %s, not that of the released %s (%s); using it",
+                path,
+                actual,
+                self.title,
+                file.sha256,
+            )
+
+    def _download(self, file: File, target: Path) -> Path:
+        import pooch  # noqa: PLC0415
+        import requests  # noqa: PLC0415
+
+        ways = (
+            f"(1) --robot.low_level.path=PATH with a copy of {target.name}, or its folder; "
+            f"(2) put it into the cache as '{target}'"
         )
-    return cached
-
-
-def _check_given_file(path: Path) -> Path:
-    if not path.is_file():
-        raise PolicyFileError(
-            f"policy file '{path}' does not exist. Give FALCON's g1_29dof.onnx with "
-            "--robot.low_level.path=FILE, or no path to use the cached or downloaded one."
-        )
-    actual = compute_sha256(path)
-    if actual != FALCON_SHA256:
-        logger.warning(
-            "policy file '%s' has SHA-256 %s, not that of the released FALCON (%s); using it",
-            path,
-            actual,
-            FALCON_SHA256,
-        )
-    return path
-
-
-def _download(target: Path) -> Path:
-    import pooch  # noqa: PLC0415
-    import requests  # noqa: PLC0415
-
-    downloader = pooch.HTTPDownloader(progressbar=True, timeout=(10, 60))
-    try:
-        pooch.retrieve(
-            FALCON_URL,
-            known_hash=f"sha256:{FALCON_SHA256}",
-            fname=target.name,
-            path=target.parent,
-            downloader=downloader,  # pyright: ignore[reportArgumentType] # pooch takes any callable
-        )
-    except (requests.RequestException, OSError) as error:
-        raise PolicyFileError(
-            f"FALCON's network is not on this machine and could not be downloaded "
-            f"({type(error).__name__}). Three ways to provide it: "
-            f"(1) --robot.low_level.path=FILE with a copy of g1_29dof.onnx; "
-            f"(2) put it into the cache as '{target}'; "
-            f"(3) be online once, it is downloaded from {FALCON_URL}. "
-            "Or use --robot.low_level.name=default, which ships with the package."
-        ) from error
-    except ValueError as error:  # pooch: the download does not have the known hash
-        raise PolicyFileError(
-            f"the download of {FALCON_URL} does not have SHA-256 {FALCON_SHA256}: {error}"
-        ) from error
-    return target
+        if file.url is None:
+            raise PolicyFileError(
+                f"{self.title}'s {target.name} is not on this machine, and it can't be downloaded. "
+                f"Two ways to provide it: {ways}."
+            )
+        downloader = pooch.HTTPDownloader(progressbar=True, timeout=(10, 60))
+        known = None if file.sha256 is None else f"sha256:{file.sha256}"
+        try:
+            pooch.retrieve(
+                file.url,
+                known_hash=known,
+                fname=target.name,
+                path=target.parent,
+                downloader=downloader,  # pyright: ignore[reportArgumentType] # takes any callable
+            )
+        except (requests.RequestException, OSError) as error:
+            raise PolicyFileError(
+                f"{self.title}'s {target.name} is not on this machine and could not be downloaded "
+                f"({type(error).__name__}). Three ways to provide it: {ways}; (3) be online once, "
+                f"it is downloaded from {file.url}. "
+                "Or use --robot.low_level.name=default, which ships with the package."
+            ) from error
+        except ValueError as error:  # pooch: the download does not have the known hash
+            raise PolicyFileError(
+                f"the download of {file.url} does not have SHA-256 {file.sha256}: {error}"
+            ) from error
+        return target

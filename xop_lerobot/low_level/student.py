@@ -17,7 +17,7 @@ from xop_lerobot.low_level.falcon_observation import (
     OBSERVATION_SIZE,
     FalconLikePolicy,
 )
-from xop_lerobot.low_level.onnx_network import OnnxNetwork, build_mlp
+from xop_lerobot.low_level.networks import OnnxNetwork, build_mlp
 from xop_lerobot.low_level.policy import POLICIES
 
 WEIGHTS_FILE = Path(__file__).parent / "weights" / "g1_student.npz"

@@ -75,7 +75,7 @@ class Morphology(ABC):
     name: str
     command_space: CommandSpace
     policies: tuple[str, ...]
-    """Low-level policies that fit this robot; the first is the default."""
+    """Low-level policies of this robot beside the tables that name it; the first is its own."""
     frames: dict[str, str]
     """Site that each tracked frame (`head`, `left_wrist`, `right_wrist`) is in the models."""
     base_body: str

@@ -93,7 +93,7 @@ class G1(Morphology):
             ),
         )
     )
-    policies = ("default", "falcon", "amo")
+    policies = ("default",)
     frames = {"head": "head", "left_wrist": "left_wrist", "right_wrist": "right_wrist"}
     base_body = "pelvis"
     arms = tuple(

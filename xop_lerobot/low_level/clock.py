@@ -1,0 +1,73 @@
+"""The clock of a gait: phases that go on, stop or begin anew."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue
+from xop_lerobot.low_level.description import Clock
+from xop_lerobot.low_level.policy import POLICY_DT
+
+NEAR = 0.05
+"""How near to where it stops a phase of a clock that ``"stops"`` has to be."""
+
+
+class GaitClock:
+    """Phases of a batch of robots, see `Clock`.
+
+    Args:
+        table: What the table says of it.
+
+    Attributes:
+        initial: Phases of a robot that has stood so far. Shape (p,).
+
+    Raises:
+        BadValue: If there are not as many phases of standing as of walking, or none of them for
+            a clock that stops.
+    """
+
+    def __init__(self, table: Clock) -> None:
+        self._table = table
+        self._phases = np.array(table.phases)
+        standing = table.standing_phases
+        if standing is not None and len(standing) != len(table.phases):
+            raise BadValue(
+                f"the clock has {len(table.phases)} phases and {len(standing)} standing_phases"
+            )
+        if standing is None and table.standing == "stops":
+            raise BadValue("a clock that stops must have standing_phases")
+        self._standing = None if standing is None else np.array(standing)
+        self.initial = self._phases
+        if table.standing == "stops" and self._standing is not None:
+            self.initial = self._standing
+
+    def step(self, phases: np.ndarray, stands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Let 20 ms pass.
+
+        Args:
+            phases: Phases before. Shape (n, p).
+            stands: Who stands. Shape (n,).
+
+        Returns:
+            Phases to show, and those to remember. Shapes (n, p).
+        """
+        table, still = self._table, stands[:, None]
+        later = np.remainder(phases + POLICY_DT / table.period, 1.0)
+        if table.standing == "resets":
+            later = np.where(still, self._phases, later)
+        elif table.standing == "stops" and self._standing is not None:
+            near = np.abs(later - self._standing[0]) < NEAR
+            later = np.where(still & near.any(axis=1, keepdims=True), self._standing, later)
+            later = np.where(~still & near.all(axis=1, keepdims=True), self._phases, later)
+        shown = later if table.advance == "before" else phases
+        if self._standing is not None and table.standing != "stops":
+            shown = np.where(still, self._standing, shown)
+        if table.stance is not None:
+            shown = stretch(shown, table.stance)
+        return shown, later
+
+
+def stretch(phases: np.ndarray, stance: float) -> np.ndarray:
+    """Map the first `stance` of a cycle to its first half, the rest to its second half."""
+    swing = 0.5 + 0.5 * (phases - stance) / (1 - stance)
+    return np.where(phases < stance, 0.5 * phases / stance, swing)

@@ -1,0 +1,129 @@
+"""The joints of a robot as tables of policies name them: by group, by name, by pattern."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue
+from xop_lerobot.morphology.morphology import Morphology
+
+GROUPS = ("all", "legs", "waist", "arms")
+"""Joints of the robot: all of them, in the model's order; those that neither a command nor an arm
+target names; those that a command names; those of the arms."""
+
+
+@dataclass(frozen=True)
+class RobotJoints:
+    """Actuated joints of a robot, in the order of the model's actuators.
+
+    Attributes:
+        names: Their names.
+        commands: Names of the entries of the command.
+        positions: Where each is in `qpos`. Shape (nu,).
+        velocities: Where each is in `qvel`. Shape (nu,).
+        low: Lower limits [rad]. Shape (nu,).
+        high: Upper limits [rad]. Shape (nu,).
+        stiffness: Of the model's servos [N m/rad]. Shape (nu,).
+        damping: Of the model's servos [N m s/rad]. Shape (nu,).
+        by_command: Joint -> entry of the command that is its angle.
+        by_arm: Joint -> arm target that is its angle.
+        nq: Size of `qpos`.
+        nv: Size of `qvel`.
+        num_arms: Number of arm targets.
+    """
+
+    names: tuple[str, ...]
+    commands: tuple[str, ...]
+    positions: np.ndarray
+    velocities: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    by_command: Mapping[int, int]
+    by_arm: Mapping[int, int]
+    nq: int
+    nv: int
+    num_arms: int
+
+    @classmethod
+    def of(cls, morphology: Morphology) -> RobotJoints:
+        """Read the joints from a robot's planning model."""
+        model = morphology.build_spec("planning").compile()
+        ids = model.actuator_trnid[:, 0]
+        names = tuple(model.joint(joint).name for joint in ids)
+        commands, arms = morphology.command_space.names, morphology.arm_names
+        bare = [name.removesuffix("_joint") for name in names]
+        low, high = np.where(model.jnt_limited[ids], model.jnt_range[ids].T, [[-np.inf], [np.inf]])
+        return cls(
+            names,
+            commands,
+            model.jnt_qposadr[ids].copy(),
+            model.jnt_dofadr[ids].copy(),
+            low,
+            high,
+            model.actuator_gainprm[:, 0].copy(),
+            -model.actuator_biasprm[:, 2],
+            {joint: commands.index(name) for joint, name in enumerate(bare) if name in commands},
+            {joint: arms.index(name) for joint, name in enumerate(names) if name in arms},
+            model.nq,
+            model.nv,
+            len(arms),
+        )
+
+    def select(self, patterns: Sequence[str]) -> list[int]:
+        """Joints that `patterns` name: pattern by pattern, each in the model's order.
+
+        Raises:
+            BadValue: If a pattern fits no joint, or a joint is named twice.
+        """
+        found: list[int] = []
+        for pattern in patterns:
+            fits = [joint for joint in range(len(self.names)) if self._fits(joint, pattern)]
+            if not fits:
+                raise BadValue(
+                    f"{pattern!r} fits no joint. Groups: {', '.join(GROUPS)}; joints: "
+                    f"{', '.join(self.names)}"
+                )
+            found += fits
+        twice = sorted({self.names[joint] for joint in found if found.count(joint) > 1})
+        if twice:
+            raise BadValue(f"{', '.join(twice)} is named twice by {', '.join(patterns)}")
+        return found
+
+    def find_command(self, entry: str) -> int:
+        """Position of an entry of the command.
+
+        Raises:
+            BadValue: Listing the entries of the robot.
+        """
+        if entry not in self.commands:
+            raise BadValue(
+                f"{entry!r} is no entry of the command. Known: {', '.join(self.commands)}"
+            )
+        return self.commands.index(entry)
+
+    def spread(self, numbers: Mapping[str, float], default: float | np.ndarray) -> np.ndarray:
+        """One number a joint, by patterns of which the last that fits counts. Shape (nu,).
+
+        Raises:
+            BadValue: If a pattern fits no joint.
+        """
+        spread = np.full(len(self.names), default, dtype=float)
+        for pattern, number in numbers.items():
+            spread[self.select([pattern])] = number
+        return spread
+
+    def is_commanded(self, joint: int) -> bool:
+        """Whether a command or an arm target is the angle of `joint`."""
+        return joint in self.by_command or joint in self.by_arm
+
+    def _fits(self, joint: int, pattern: str) -> bool:
+        if pattern not in GROUPS:
+            return fnmatchcase(self.names[joint], pattern)
+        waist, arm = joint in self.by_command, joint in self.by_arm
+        return {"all": True, "legs": not (waist or arm), "waist": waist, "arms": arm}[pattern]

@@ -1,0 +1,310 @@
+"""The executor of every policy that is a table: one network a mode, batched."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadShape, BadValue
+from xop_lerobot.low_level import description as d
+from xop_lerobot.low_level.joints import RobotJoints
+from xop_lerobot.low_level.network_stage import NetworkStage, Situation
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
+from xop_lerobot.low_level.terms import FeatureColumns
+from xop_lerobot.transforms import compute_projected_gravity
+
+if TYPE_CHECKING:
+    import mujoco
+
+_BASE_Q, _BASE_V = 7, 6
+"""Sizes of the free joint of the base in `qpos` and `qvel`."""
+
+
+@dataclass(frozen=True)
+class MotorSet:
+    """Motors by joint.
+
+    Attributes:
+        stiffness: k_p [N m/rad]. Shape (nu,).
+        damping: k_d [N m s/rad]. Shape (nu,).
+        torque: Largest torque [N m]; infinite for the model's own. Shape (nu,).
+    """
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    torque: np.ndarray
+
+    @classmethod
+    def read(cls, table: d.Motors, joints: RobotJoints) -> MotorSet:
+        """The motors of a table; those that it does not name are the model's."""
+        return cls(
+            joints.spread(table.stiffness, joints.stiffness),
+            joints.spread(table.damping, joints.damping),
+            joints.spread(table.torque, np.inf),
+        )
+
+    def matches(self, other: MotorSet) -> bool:
+        """Whether the servos of both do the same."""
+        same = np.array_equal(self.stiffness, other.stiffness)
+        return same and np.array_equal(self.damping, other.damping)
+
+
+def convert_targets(
+    targets: np.ndarray, q: np.ndarray, v: np.ndarray, of: MotorSet, to: MotorSet
+) -> np.ndarray:
+    r"""Convert position targets so that other servos give the same torque now.
+
+    .. math:: q^*_2 = q + \frac{k_{p1} (q^*_1 - q) - (k_{d1} - k_{d2})\, \dot q}{k_{p2}}
+
+    Args:
+        targets: Targets under the servos `of` [rad]. Shape (n, nu).
+        q: Angles [rad]. Shape (n, nu).
+        v: Velocities [rad/s]. Shape (n, nu).
+        of: Servos 1.
+        to: Servos 2.
+
+    Returns:
+        Targets under the servos `to` [rad]. Shape (n, nu).
+    """
+    pull = of.stiffness * (targets - q) - (of.damping - to.damping) * v
+    return q + pull / to.stiffness
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A network of a policy, and the motors that it was trained with."""
+
+    network: NetworkStage
+    motors: MotorSet
+    low: np.ndarray
+    """Lowest command that it is asked for in stationary and in mobile mode. Shape (2, k)."""
+    high: np.ndarray
+    """Highest command that it is asked for. Shape (2, k)."""
+
+
+class NetworkPolicy(LowLevelPolicy):
+    r"""Networks that a table describes: one that stands and one that walks, or one for both.
+
+    Where there are two, the one that rests watches: it remembers the frames that it would have
+    seen, and outputs that would have given what was executed (its recurrent state begins anew). So
+    it can take over at any time; what its first targets differ from the last ones is taken back
+    within the time of the hand-over, so that targets never step.
+
+    Its memory is that of the network; with two: the mode (-1 before the first step), what is left
+    of the hand-over [s], the difference of targets at its beginning (nu), the last targets (nu),
+    and the memories of both.
+
+    Args:
+        name: What it is called.
+        table: The table.
+        joints: The robot's joints.
+        stationary: What stands.
+        mobile: What walks; the same object as `stationary` for one network.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        table: d.PolicyTable,
+        joints: RobotJoints,
+        stationary: Stage,
+        mobile: Stage,
+    ) -> None:
+        self.name, self.table, self._joints = name, table, joints
+        self.arm_limits: Mapping[str, tuple[float, float]] = _expand(table.arm_limits, joints)
+        self.motors = MotorSet.read(table.motors, joints)
+        self._stages = (stationary,) if mobile is stationary else (stationary, mobile)
+        self._columns = FeatureColumns(joints)
+        self._handover_s = table.handover_s
+        self._slow = np.full(len(joints.commands), np.inf)
+        for entry, size in table.stands_below.items():
+            self._slow[joints.find_command(entry)] = size
+        self._has_slow = bool(table.stands_below)
+        self._turns = joints.commands.index("yaw_rate") if "yaw_rate" in joints.commands else None
+        self._waist, self._arms = _pair(joints.by_command), _pair(joints.by_arm)
+        self.memory_size = sum(stage.network.memory_size for stage in self._stages)
+        if len(self._stages) > 1:
+            self.memory_size += 2 + 2 * len(joints.names)
+
+    def adapt(self, model: mujoco.MjModel) -> None:
+        """Give `model` the motors that the policy was trained with; see `LowLevelPolicy`."""
+        for joint, name in enumerate(self._joints.names):
+            index = model.actuator(name).id
+            model.actuator_gainprm[index, 0] = self.motors.stiffness[joint]
+            model.actuator_biasprm[index, 1] = -self.motors.stiffness[joint]
+            model.actuator_biasprm[index, 2] = -self.motors.damping[joint]
+            torque = self.motors.torque[joint]
+            if np.isfinite(torque):
+                model.actuator_forcerange[index] = -torque, torque
+
+    def initial_memory(self, n: int = 1) -> np.ndarray:
+        """Memory of a policy that has not run yet. Shape (n, memory_size)."""
+        memories = [stage.network.initial_memory(n) for stage in self._stages]
+        if len(memories) == 1:
+            return memories[0]
+        seam = np.zeros((n, 2 + 2 * len(self._joints.names)))
+        seam[:, 0] = -1
+        return np.concatenate([seam, *memories], axis=1)
+
+    def act(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        command: np.ndarray,
+        arms: np.ndarray,
+        memory: np.ndarray,
+        mode: Mode | np.ndarray,
+    ) -> PolicyOutput:
+        """Compute motor targets for the next 20 ms; see `LowLevelPolicy.act`.
+
+        `mode` may also hold one mode for each member of the batch. Shape (n,).
+
+        Raises:
+            BadShape: If an argument does not fit the robot.
+        """
+        n, joints = len(qpos), self._joints
+        qpos = check_batch("qpos", qpos, n, joints.nq)
+        qvel = check_batch("qvel", qvel, n, joints.nv)
+        command = check_batch("command", command, n, len(joints.commands))
+        arms = check_batch("arms", arms, n, joints.num_arms)
+        memory = check_batch("memory", memory, n, self.memory_size)
+        modes = np.broadcast_to(np.asarray(mode, dtype=int), (n,))
+        situation = self._look(qpos, qvel, command, arms, modes)
+        if len(self._stages) == 1:
+            targets, after = self._run(0, situation, memory)
+        else:
+            targets, after = self._run_both(situation, memory)
+        np.maximum(targets, joints.low, out=targets)
+        return PolicyOutput(np.minimum(targets, joints.high, out=targets), after)
+
+    def _look(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        command: np.ndarray,
+        arms: np.ndarray,
+        modes: np.ndarray,
+    ) -> Situation:
+        """What the networks may see."""
+        columns, joints = self._columns, self._joints
+        walks = modes == Mode.MOBILE
+        stands = ~walks
+        if self._has_slow:
+            stands = stands | (np.abs(command) < self._slow).all(axis=1)
+        which = 0 if len(self._stages) == 1 else np.where(stands, 0, 1)
+        low, high = self._bounds
+        command = np.minimum(np.maximum(command, low[which, modes]), high[which, modes])
+        shared = np.zeros((len(qpos), columns.num_shared))
+        shared[:, columns["angular_velocity"]] = qvel[:, 3:6]
+        shared[:, columns["gravity"]] = compute_projected_gravity(qpos[:, 3:7])
+        shared[:, columns["positions"]] = qpos[:, joints.positions]
+        shared[:, columns["velocities"]] = qvel[:, joints.velocities]
+        targets = shared[:, columns["targets"]]
+        targets[:, self._waist[0]] = command[:, self._waist[1]]
+        targets[:, self._arms[0]] = arms[:, self._arms[1]]
+        shared[:, columns["commands"]] = command
+        shared[:, columns["walks"]] = walks[:, None]
+        yaw_rate = np.zeros(len(qpos)) if self._turns is None else command[:, self._turns]
+        return Situation(shared, stands, qpos[:, 3:7], yaw_rate)
+
+    @cached_property
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Commands that each network is asked for in each mode. Shapes (stages, 2, k)."""
+        return (
+            np.stack([stage.low for stage in self._stages]),
+            np.stack([stage.high for stage in self._stages]),
+        )
+
+    def _run(
+        self, index: int, situation: Situation, memory: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Run one network; its targets are for the policy's motors."""
+        stage = self._stages[index]
+        targets, after = stage.network.act(situation, memory)
+        return self._convert(targets, situation, stage.motors, self.motors), after
+
+    def _convert(
+        self, targets: np.ndarray, situation: Situation, of: MotorSet, to: MotorSet
+    ) -> np.ndarray:
+        if of.matches(to):
+            return targets
+        q, v = (situation.shared[:, self._columns[name]] for name in ("positions", "velocities"))
+        return convert_targets(targets, q, v, of, to)
+
+    def _run_both(self, situation: Situation, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Run for each robot the network of its mode, and let the other one watch."""
+        nu = len(self._joints.names)
+        sizes = [2 + 2 * nu, *(stage.network.memory_size for stage in self._stages)]
+        seam, *memories = np.split(memory, np.cumsum(sizes)[:-1], axis=1)
+        active = np.where(situation.stands, 0, 1)
+        targets = np.empty((len(memory), nu))
+        after = [np.empty_like(each) for each in memories]
+        rows_of = [np.flatnonzero(active == index) for index in (0, 1)]
+        for index, rows in enumerate(rows_of):
+            if len(rows):
+                part = situation.choose(rows)
+                targets[rows], after[index][rows] = self._run(index, part, memories[index][rows])
+        targets, seam = self._hand_over(active, targets, seam)
+        for index, rows in enumerate(rows_of):
+            if len(rows):
+                other = self._stages[1 - index]
+                part = situation.choose(rows)
+                theirs = self._convert(targets[rows], part, self.motors, other.motors)
+                watched = other.network.watch(part, memories[1 - index][rows], theirs)
+                after[1 - index][rows] = watched
+        return targets, np.concatenate([seam, *after], axis=1)
+
+    def _hand_over(
+        self, active: np.ndarray, targets: np.ndarray, seam: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Let targets go from one network's to the other's without a step."""
+        nu = targets.shape[1]
+        later = np.empty_like(seam)
+        before, left = seam[:, 0], seam[:, 1]
+        changes = (before >= 0) & (before != active) & (self._handover_s > 0)
+        difference = np.where(changes[:, None], seam[:, 2 + nu :] - targets, seam[:, 2 : 2 + nu])
+        left = np.where(changes, self._handover_s, np.maximum(left - POLICY_DT, 0.0))
+        share = left / self._handover_s if self._handover_s > 0 else left
+        targets = targets + share[:, None] * difference
+        later[:, 0], later[:, 1] = active, left
+        later[:, 2 : 2 + nu], later[:, 2 + nu :] = difference, targets
+        return targets, later
+
+
+def _pair(mapping: Mapping[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Joints, and where their targets come from."""
+    return np.array(list(mapping), dtype=int), np.array(list(mapping.values()), dtype=int)
+
+
+def check_batch(name: str, array: np.ndarray, n: int, size: int) -> np.ndarray:
+    """Return `array` as floats of shape (n, size).
+
+    Raises:
+        BadShape: Naming the argument, its expected and its actual shape.
+    """
+    array = np.asarray(array, dtype=float)
+    if array.shape != (n, size):
+        raise BadShape(name, (n, size), array.shape)
+    return array
+
+
+def _expand(
+    limits: Mapping[str, tuple[float, float]], joints: RobotJoints
+) -> dict[str, tuple[float, float]]:
+    """Limits of arm joints by their names.
+
+    Raises:
+        BadValue: If a pattern names a joint that is no arm's.
+    """
+    expanded = {}
+    for pattern, pair in limits.items():
+        for joint in joints.select([pattern]):
+            if joint not in joints.by_arm:
+                raise BadValue(f"arm_limits names {joints.names[joint]}, which is no joint of arms")
+            expanded[joints.names[joint]] = pair
+    return expanded

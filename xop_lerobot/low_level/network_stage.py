@@ -1,0 +1,310 @@
+"""One network of a policy, batched: what it sees, what it remembers, what its outputs move."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue
+from xop_lerobot.low_level import description as d
+from xop_lerobot.low_level.clock import GaitClock
+from xop_lerobot.low_level.joints import RobotJoints
+from xop_lerobot.low_level.networks import LoadedNetwork, ReferenceNetwork
+from xop_lerobot.low_level.policy import POLICY_DT
+from xop_lerobot.low_level.terms import FeatureColumns, TermReader, describe, spread_over
+from xop_lerobot.transforms import quat_yaw, wrap_angle
+
+
+class Situation(NamedTuple):
+    """What all networks of a policy may see of a batch.
+
+    Attributes:
+        shared: Features that need no memory (`FeatureColumns`). Shape (n, F).
+        stands: Who stands. Shape (n,), bool.
+        quat: Orientation of the base, wxyz. Shape (n, 4).
+        yaw_rate: Commanded yaw rate [rad/s]. Shape (n,).
+    """
+
+    shared: np.ndarray
+    stands: np.ndarray
+    quat: np.ndarray
+    yaw_rate: np.ndarray
+
+    def choose(self, rows: np.ndarray) -> Situation:
+        """Some rows of the batch."""
+        return Situation(*(each[rows] for each in self))
+
+
+class NetworkStage:
+    """One network with its memory; a pure function of a batch.
+
+    The memory holds the last outputs, the clock's phases, the wanted heading and whether the
+    robot stood, the recurrent state, whether a frame was seen, and the frames of the past, oldest
+    first: each only where the table needs it, but for the outputs.
+
+    Args:
+        table: What the table says of it.
+        joints: The robot's joints.
+        network: Its weights.
+        reference: The network before it, where the table names one.
+
+    Attributes:
+        memory_size: Numbers that it remembers.
+
+    Raises:
+        BadValue: If the table does not fit the robot, or the network the table.
+    """
+
+    def __init__(
+        self,
+        table: d.Network,
+        joints: RobotJoints,
+        network: LoadedNetwork,
+        reference: ReferenceNetwork | None = None,
+    ) -> None:
+        self._joints, self._network, self._reference = joints, network, reference
+        self._default = joints.spread(table.default, 0.0)
+        self._clip_seen = table.clip_seen
+        self._clock = None if table.clock is None else GaitClock(table.clock)
+        num_phases = 0 if table.clock is None else len(table.clock.phases)
+        self._read_action(table.action)
+        num_references = 0 if reference is None else reference.num_outputs
+        self._columns = FeatureColumns(joints, len(self._outputs), num_phases, num_references)
+        reader = TermReader(joints, self._default, self._outputs, self._columns, num_phases)
+        self._read_observation(table, reader)
+        seen = [*table.sees, *(() if table.reference is None else table.reference.sees)]
+        self._sees_heading = any(isinstance(term, d.HeadingError) for term in seen)
+        self._sees_tilt = any(isinstance(term, d.RollPitch) for term in seen)
+        if reference is not None and table.reference is not None:
+            self._reference_terms = reader.read(table.reference.sees)
+            width = len(self._reference_terms.offset)
+            if reference.num_inputs not in (None, width):
+                raise BadValue(
+                    f"the reference has {reference.num_inputs} inputs, and its terms are {width} "
+                    "numbers"
+                )
+        self._lay_out_memory(num_phases, begins=table.begins == "first frame")
+
+    # ------------------------------------------------------------ what the table says
+
+    def _read_action(self, action: d.Action) -> None:
+        joints, outputs = self._joints, self._joints.select(action.joints)
+        found = self._network.num_outputs
+        if found not in (None, len(outputs)):
+            raise BadValue(
+                f"the network has {found} outputs, and action.joints are {len(outputs)} joints"
+            )
+        unused, residual = joints.select(action.discard), joints.select(action.residual)
+        scale = spread_over(action.scale, joints, outputs, len(outputs), "action")
+        self._outputs, self._clip = outputs, action.clip
+        self._used = np.array([row for row, joint in enumerate(outputs) if joint not in unused])
+        self._moved = np.array(outputs)[self._used]
+        self._scale = scale[self._used]
+        self._adds = np.isin(self._moved, residual)
+        self._centre = np.where(self._adds, 0.0, self._default[self._moved])
+        held = joints.select(action.hold)
+        free = [not joints.is_commanded(joint) for joint in range(len(joints.names))]
+        self._resting = np.flatnonzero(np.isin(range(len(joints.names)), held) | free)
+
+    def _read_observation(self, table: d.Network, reader: TermReader) -> None:
+        """Decide where each number of now, and of the past, is in the observation."""
+        now = [term for term in table.sees if not isinstance(term, d.Past)]
+        pasts = [term for term in table.sees if isinstance(term, d.Past)]
+        self._terms = reader.read(now)
+        widths, kept, places = self._terms.widths, [], []
+        starts = np.concatenate([[0], np.cumsum(widths)]).astype(int)
+        for index, term in enumerate(now):
+            if term.remembered:
+                places.append(range(len(kept), len(kept) + widths[index]))
+                kept += range(starts[index], starts[index + 1])
+        self._kept = np.array(kept, dtype=int)
+        self._keeps_all = len(kept) == starts[-1]
+        self._whole = table.whole_past or 0
+        self._num_frames = max([self._whole - 1, 0, *(term.frames for term in pasts)])
+        past = self._num_frames * len(kept)  # a row of the buffer is the past, then now
+        order: list[int] = []
+        sizes: list[str] = []
+        ranges = iter(zip(starts[:-1], starts[1:], strict=True))
+        for term in table.sees:
+            if isinstance(term, d.Past):
+                part = _order_past(term, self._num_frames, len(kept), places)
+            else:
+                start, stop = next(ranges)
+                part = list(range(past + start, past + stop))
+            order += part
+            sizes.append(f"{describe(term)} {len(part)}")
+        if self._network.num_inputs not in (None, len(order)):
+            raise BadValue(
+                f"the network has {self._network.num_inputs} inputs, and its terms are "
+                f"{len(order)} numbers: {', '.join(sizes)}"
+            )
+        self._past_size, self._now_size = past, int(starts[-1])
+        in_order = order == list(range(past + self._now_size))
+        self._order = None if in_order else np.array(order, dtype=int)
+
+    def _lay_out_memory(self, num_phases: int, *, begins: bool) -> None:
+        sizes = {
+            "actions": len(self._outputs),
+            "phases": num_phases,
+            "heading": 2 if self._sees_heading else 0,  # the wanted one; whether it stood
+            "hidden": self._network.num_hidden,
+            "begun": int(begins),
+            "past": self._past_size,
+        }
+        self._begins = begins
+        self._places: dict[str, slice] = {}
+        self.memory_size = 0
+        for name, size in sizes.items():
+            self._places[name] = slice(self.memory_size, self.memory_size + size)
+            self.memory_size += size
+
+    # ------------------------------------------------------------ one step
+
+    def initial_memory(self, n: int) -> np.ndarray:
+        """No output and no frame yet; the robot stands. Shape (n, memory_size)."""
+        memory = np.zeros((n, self.memory_size))
+        if self._clock is not None:
+            memory[:, self._places["phases"]] = self._clock.initial
+        if self._sees_heading:
+            memory[:, self._places["heading"].stop - 1] = 1.0
+        return memory
+
+    def act(self, situation: Situation, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Run the network once.
+
+        Args:
+            situation: The batch.
+            memory: Memory before the step. Shape (n, memory_size).
+
+        Returns:
+            Targets of all joints [rad], before any limit, shape (n, nu), and the memory after.
+        """
+        seen, whole, after = self.observe(situation, memory)
+        actions, hidden = self._network(seen, memory[:, self._places["hidden"]], whole)
+        if self._clip is not None:
+            actions = np.minimum(np.maximum(actions, -self._clip), self._clip)
+        after[:, self._places["actions"]] = actions
+        after[:, self._places["hidden"]] = hidden
+        targets = self._rest(situation)
+        moved = actions if len(self._used) == len(self._outputs) else actions[:, self._used]
+        moved = self._centre + self._scale * moved
+        if self._adds.any():
+            moved[:, self._adds] += targets[:, self._moved[self._adds]]
+        targets[:, self._moved] = moved
+        return targets, after
+
+    def watch(self, situation: Situation, memory: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """Remember a step that another network made.
+
+        Its outputs are taken to be those that would have given `targets`, so the network can go
+        on from there at any time. A recurrent state begins anew.
+
+        Args:
+            situation: The batch.
+            memory: Memory before the step. Shape (n, memory_size).
+            targets: Targets of all joints under this network's motors [rad]. Shape (n, nu).
+
+        Returns:
+            The memory after the step.
+        """
+        _, _, after = self.observe(situation, memory)
+        base = np.where(self._adds, self._rest(situation)[:, self._moved], self._centre)
+        outputs = np.zeros((len(targets), len(self._outputs)))
+        outputs[:, self._used] = (targets[:, self._moved] - base) / self._scale
+        if self._clip is not None:
+            outputs = np.clip(outputs, -self._clip, self._clip)
+        after[:, self._places["actions"]] = outputs
+        after[:, self._places["hidden"]] = 0.0
+        return after
+
+    def observe(
+        self, situation: Situation, memory: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        """What the network sees now.
+
+        Returns:
+            The observation, float32, shape (n, num_inputs); the second input, where there is
+            one; and the memory after the step, to which outputs and recurrent state are still
+            to be written.
+        """
+        after = np.empty((len(memory), self.memory_size))
+        now = self._terms(self._compute_features(situation, memory, after))
+        if not self._past_size:
+            seen = now if self._order is None else now[:, self._order]
+            return self._finish(seen), None, after
+        buffer = np.empty((len(memory), self._past_size + self._now_size))
+        buffer[:, self._past_size :] = now
+        past = buffer[:, : self._past_size]
+        past[:] = memory[:, self._places["past"]]
+        frame = now if self._keeps_all else now[:, self._kept]
+        if self._begins:
+            begun = self._places["begun"]
+            fresh = memory[:, begun.start] == 0
+            past[fresh] = np.tile(frame[fresh], self._num_frames)
+            after[:, begun] = 1.0
+        later, size = after[:, self._places["past"]], frame.shape[1]
+        later[:, :-size] = past[:, size:]
+        later[:, -size:] = frame
+        seen = buffer if self._order is None else buffer[:, self._order]
+        whole = None
+        if self._whole:
+            frames = np.concatenate([past, frame], axis=1)
+            whole = frames[:, -self._whole * size :].astype(np.float32)
+        return self._finish(seen), whole, after
+
+    def _finish(self, seen: np.ndarray) -> np.ndarray:
+        if self._clip_seen is not None:
+            seen = np.clip(seen, -self._clip_seen, self._clip_seen)
+        return seen.astype(np.float32)
+
+    def _rest(self, situation: Situation) -> np.ndarray:
+        """Targets of joints that no output moves. Shape (n, nu)."""
+        targets = situation.shared[:, self._columns["targets"]].copy()
+        targets[:, self._resting] = self._default[self._resting]
+        return targets
+
+    def _compute_features(
+        self, situation: Situation, memory: np.ndarray, after: np.ndarray
+    ) -> np.ndarray:
+        """All features of a batch; writes phases and heading to the memory `after`. (n, F)."""
+        columns = self._columns
+        features = np.zeros((len(memory), columns.size))
+        features[:, : columns.num_shared] = situation.shared
+        features[:, columns["actions"]] = memory[:, self._places["actions"]]
+        if self._clock is not None:
+            shown, phases = self._clock.step(memory[:, self._places["phases"]], situation.stands)
+            after[:, self._places["phases"]] = phases
+            features[:, columns["sin"]] = np.sin(2 * np.pi * shown)
+            features[:, columns["cos"]] = np.cos(2 * np.pi * shown)
+        if self._sees_tilt:
+            features[:, columns["roll_pitch"]] = compute_roll_pitch(situation.quat)
+        if self._sees_heading:
+            wanted, stood = memory[:, self._places["heading"]].T
+            yaw = quat_yaw(situation.quat)
+            wanted = np.where(stood > 0, yaw, wanted + situation.yaw_rate * POLICY_DT)
+            turn = yaw - wanted
+            after[:, self._places["heading"]] = np.stack(
+                [wrap_angle(wanted), situation.stands], axis=1
+            )
+            features[:, columns["heading"]] = np.stack([np.sin(turn), np.cos(turn)], axis=1)
+        if self._reference is not None:
+            features[:, columns["reference"]] = self._reference(self._reference_terms(features))
+        return features
+
+
+def compute_roll_pitch(quat: np.ndarray) -> np.ndarray:
+    """Roll and pitch of the base [rad]. Shape (n, 4) -> (n, 2)."""
+    w, x, y, z = quat.T
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    return np.stack([roll, pitch], axis=1)
+
+
+def _order_past(term: d.Past, num_frames: int, size: int, places: list[range]) -> list[int]:
+    """Where in the buffer the numbers of the past are, in the order in which they are shown."""
+    frames = list(range(num_frames))[-term.frames :]  # oldest first
+    if term.order == "newest first":
+        frames.reverse()
+    groups = [range(size)] if term.by == "frame" else places
+    return [frame * size + place for group in groups for frame in frames for place in group]

@@ -1,0 +1,191 @@
+"""Policies that are tables: those that ship with the package, and a user's own."""
+
+from __future__ import annotations
+
+import logging
+from functools import cache, partial
+from pathlib import Path
+from typing import get_args
+
+import msgspec
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.errors import BadValue, PolicyFileError
+from xop_lerobot.low_level import description as d
+from xop_lerobot.low_level.joints import RobotJoints
+from xop_lerobot.low_level.network_policy import MotorSet, NetworkPolicy, Stage
+from xop_lerobot.low_level.network_stage import NetworkStage
+from xop_lerobot.low_level.networks import ReferenceNetwork, load_network
+from xop_lerobot.low_level.policy import POLICIES
+from xop_lerobot.low_level.policy_file import FileFinder
+from xop_lerobot.morphology.morphology import MORPHOLOGIES, make_morphology
+
+logger = logging.getLogger(__name__)
+
+FOLDER = Path(__file__).parent / "policies"
+"""Tables that ship with the package."""
+SUFFIX = ".toml"
+
+
+def list_tables() -> tuple[str, ...]:
+    """Names of the tables that ship with the package."""
+    return tuple(sorted(file.stem for file in FOLDER.glob(f"*{SUFFIX}")))
+
+
+def is_table(name: str) -> bool:
+    """Whether `name` is the path of a table, not the name of a policy."""
+    return name.endswith(SUFFIX)
+
+
+def find_robot(name: str) -> str:
+    """The robot of a table, by its name or its path.
+
+    Raises:
+        PolicyFileError: If there is no such table, or it is malformed.
+    """
+    return read_table(find_table(name)).robot
+
+
+def find_table(name: str) -> Path:
+    """The file of a table, by its name or its path.
+
+    Raises:
+        PolicyFileError: If there is no such file.
+    """
+    file = Path(name).expanduser() if is_table(name) else FOLDER / f"{name}{SUFFIX}"
+    if not file.is_file():
+        raise PolicyFileError(f"policy table '{file}' does not exist")
+    return file
+
+
+def read_table(file: Path) -> d.PolicyTable:
+    """Read a table.
+
+    Raises:
+        PolicyFileError: If it is no TOML, or breaks the grammar of `description`; says where.
+    """
+    try:
+        return msgspec.toml.decode(file.read_bytes(), type=d.PolicyTable)
+    except (msgspec.ValidationError, msgspec.DecodeError, UnicodeDecodeError) as error:
+        hint = ""
+        if ".term" in str(error):
+            terms = sorted(_tag(term) for term in (*get_args(d.Seen.__value__), d.Past))
+            hint = f". Known terms: {', '.join(terms)}"
+        raise PolicyFileError(f"policy table '{file}': {error}{hint}") from error
+
+
+def _tag(term: type[msgspec.Struct]) -> str:
+    return str(term.__struct_config__.tag)
+
+
+@cache
+def read_joints(robot: str) -> RobotJoints:
+    """The joints of a robot."""
+    return RobotJoints.of(make_morphology(robot))
+
+
+def load_policy(name: str, path: str | None = None) -> NetworkPolicy:
+    """Load the policy of a table.
+
+    Args:
+        name: Name of a table that ships with the package, or the path of one.
+        path: Its file, or the folder of its files; None to look beside the table, in the cache,
+            and where they are published.
+
+    Raises:
+        PolicyFileError: If the table or a file is missing or not what it should be.
+    """
+    file = find_table(name)
+    table = read_table(file)
+    try:
+        return _build(name if name in list_tables() else file.stem, file, table, path)
+    except BadValue as error:
+        raise PolicyFileError(f"policy table '{file}': {error}") from error
+
+
+def _build(name: str, file: Path, table: d.PolicyTable, path: str | None) -> NetworkPolicy:
+    if table.robot not in MORPHOLOGIES:
+        make_morphology(table.robot)  # says which robots there are
+    joints = read_joints(table.robot)
+    parts = {part: _load_part(part, file, table, path) for part in _parts(table)}
+    return NetworkPolicy(name, table, joints, parts[table.stationary], parts[table.mobile])
+
+
+def _parts(table: d.PolicyTable) -> set[str]:
+    return {table.stationary, table.mobile}
+
+
+def _load_part(part: str, file: Path, table: d.PolicyTable, path: str | None) -> Stage:
+    """A network of this table, or the one of another policy that runs in the same mode."""
+    if part in table.networks:
+        return _load_stage(part, file, table, path)
+    other = find_table(part if not is_table(part) else str(file.parent / part))
+    theirs = read_table(other)
+    if theirs.robot != table.robot:
+        raise BadValue(f"{part} is a policy of '{theirs.robot}', this one of '{table.robot}'")
+    mode = Mode.STATIONARY if part == table.stationary else Mode.MOBILE
+    network = theirs.find_part(mode)
+    if network not in theirs.networks:
+        raise BadValue(f"{part} has no network of its own for this mode: it names '{network}'")
+    return _load_stage(network, other, theirs, path)
+
+
+def _load_stage(name: str, file: Path, table: d.PolicyTable, path: str | None) -> Stage:
+    joints, network = read_joints(table.robot), table.networks[name]
+    files = _list_files(table)
+    given = None if path is None else Path(path).expanduser()
+    finder = FileFinder(table.title, file.parent, given, len(files))
+    _say_terms(table)
+    weights = load_network(finder.find(network.file))
+    reference = None
+    if network.reference is not None:
+        statistics = network.reference.statistics
+        reference = ReferenceNetwork(
+            load_network(finder.find(network.reference.file)),
+            None if statistics is None else finder.find(statistics),
+        )
+    low, high = _read_ranges(table, joints)
+    try:
+        stage = NetworkStage(network, joints, weights, reference)
+    except BadValue as error:
+        raise BadValue(f"network '{name}': {error}") from error
+    return Stage(stage, MotorSet.read(table.motors, joints), low, high)
+
+
+def _list_files(table: d.PolicyTable) -> list[d.File]:
+    files: list[d.File] = []
+    for network in table.networks.values():
+        files.append(network.file)
+        if network.reference is not None:
+            files.append(network.reference.file)
+            files += [] if network.reference.statistics is None else [network.reference.statistics]
+    return files
+
+
+def _read_ranges(table: d.PolicyTable, joints: RobotJoints) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest command in each mode. Shapes (2, k)."""
+    low = np.full((2, len(joints.commands)), -np.inf)
+    high = -low
+    for mode in Mode:
+        for entry, (lowest, highest) in table.ranges.get(mode.name.lower(), {}).items():
+            column = joints.find_command(entry)
+            low[mode, column], high[mode, column] = lowest, highest
+    return low, high
+
+
+_said: set[str] = set()
+
+
+def _say_terms(table: d.PolicyTable) -> None:
+    """Tell the licence, once a policy and process."""
+    if table.title in _said:
+        return
+    _said.add(table.title)
+    logger.info("%s: licence %s, %s", table.title, table.license, table.source)
+    if table.terms:
+        logger.warning("%s: %s", table.title, table.terms)
+
+
+for _name in list_tables():
+    POLICIES.add(_name, partial(load_policy, _name))
