@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-import xop_lerobot.low_level.falcon  # noqa: F401 registers the policy
 from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.low_level.policy import POLICY_DT, make_policy

@@ -30,18 +30,10 @@ from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.comparison import compare_policies, replace_table, write_table
 from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
-from xop_lerobot.low_level.falcon import Falcon
-from xop_lerobot.low_level.falcon_observation import (
-    ACTION_SCALE,
-    ARMS,
-    MEMORY_SIZE,
-    NUM_JOINTS,
-    OBSERVATION_SIZE,
-    FalconLikePolicy,
-    compute_targets,
-)
-from xop_lerobot.low_level.policy import PolicyOutput
-from xop_lerobot.low_level.student import Student, load_weights, save_weights
+from xop_lerobot.low_level.joints import read_joints
+from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
+from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
+from xop_lerobot.low_level.tables import load_policy
 from xop_lerobot.low_level.trial import BatchSimulation
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -74,12 +66,19 @@ BLOCK_STEPS = 50
 REFINE_AFTER = 3
 """Rounds of experience before an earlier student is trained further."""
 
-OUTPUT_WEIGHTS = np.ones(NUM_JOINTS)
+JOINTS = read_joints("g1")
+ARMS = slice(JOINTS.arms[0], JOINTS.arms[-1] + 1)
+ACTIONS = slice(0, len(JOINTS.names))
+"""Last actions in the memory of student and FALCON."""
+ACTION_SCALE = 0.25
+"""Of both tables."""
+
+OUTPUT_WEIGHTS = np.ones(len(JOINTS.names))
 OUTPUT_WEIGHTS[13:15] = 0.1  # waist roll and pitch: only seen as a last action
-OUTPUT_WEIGHTS[15:] = 0.3  # arms: a small residual
+OUTPUT_WEIGHTS[ARMS] = 0.3  # arms: a small residual
 
 
-class Teacher(Falcon):
+class Teacher:
     r"""FALCON, whose arms' part of the action bears the arms' weight.
 
     The servos of the arms are soft. Their targets are offset by the torque of gravity over their
@@ -89,10 +88,8 @@ class Teacher(Falcon):
         path: FALCON's ONNX file; None for the cached or downloaded one.
     """
 
-    name = "teacher"
-
     def __init__(self, path: str | None) -> None:
-        super().__init__(path)
+        self.policy = load_policy("falcon", path)
         self._model = build_model(make_morphology("g1"), "planning")
         self._data = mujoco.MjData(self._model)
         self._stiffness = self._model.actuator_gainprm[ARMS, 0]
@@ -107,10 +104,12 @@ class Teacher(Falcon):
         mode: Mode | np.ndarray,
     ) -> PolicyOutput:
         """Compute motor targets for the next 20 ms; see `LowLevelPolicy.act`."""
-        after = super().act(qpos, qvel, command, arms, memory, mode).memory
-        action = after[:, :NUM_JOINTS]
-        action[:, ARMS] = self._compute_offsets(qpos) / ACTION_SCALE
-        return PolicyOutput(compute_targets(action, command, arms), after)
+        targets, after = self.policy.act(qpos, qvel, command, arms, memory, mode)
+        offsets = self._compute_offsets(qpos)
+        after[:, ACTIONS][:, ARMS] = offsets / ACTION_SCALE
+        low, high = JOINTS.low[ARMS], JOINTS.high[ARMS]
+        targets[:, ARMS] = np.clip(arms + offsets, low, high)
+        return PolicyOutput(targets, after)
 
     def _compute_offsets(self, qpos: np.ndarray) -> np.ndarray:
         """Offsets of the arms' targets [rad]. Shapes (n, 36) -> (n, 14)."""
@@ -126,16 +125,15 @@ class Teacher(Falcon):
         return offsets
 
 
-class Network(FalconLikePolicy):
+class Network(LoadedNetwork):
     """The student while it is trained: standardised inputs, ELU between the layers."""
-
-    name = "student in training"
 
     def __init__(self, hidden: tuple[int, ...], observations: torch.Tensor) -> None:
         self.mean = observations.mean(0)
         spread = observations.std(0)
         self.spread = torch.where(spread < 1e-4, torch.ones_like(spread), spread.clamp(min=0.02))  # noqa: PLR2004
-        sizes = (OBSERVATION_SIZE, *hidden, NUM_JOINTS)
+        sizes = (observations.shape[1], *hidden, len(JOINTS.names))
+        self.num_inputs, self.num_outputs = sizes[0], sizes[-1]
         layers: list[nn.Module] = []
         for inputs, outputs in zip(sizes, sizes[1:], strict=False):
             layers += [nn.Linear(inputs, outputs), nn.ELU()]
@@ -145,10 +143,14 @@ class Network(FalconLikePolicy):
         """Shift and scale observations to about zero mean and unit spread."""
         return (observation - self.mean) / self.spread
 
-    def infer(self, observation: np.ndarray) -> np.ndarray:
-        """Run the network; see `FalconLikePolicy.infer`."""
+    def __call__(
+        self, observation: np.ndarray, hidden: np.ndarray, past: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Run the network; see `LoadedNetwork`."""
+        del past
         with torch.no_grad():
-            return self.body(self.standardise(torch.from_numpy(observation))).numpy()
+            seen = self.standardise(torch.from_numpy(observation))
+            return self.body(seen).numpy(), hidden
 
     def load(self, weights: list[np.ndarray], biases: list[np.ndarray]) -> None:
         """Take the layers of a saved student; the inverse of `layers`."""
@@ -175,9 +177,9 @@ class Network(FalconLikePolicy):
 class Experience:
     """All observations met so far and the teacher's action in each, in half precision."""
 
-    def __init__(self, capacity: int) -> None:
-        self.observations = torch.empty((capacity, OBSERVATION_SIZE), dtype=torch.float16)
-        self.actions = torch.empty((capacity, NUM_JOINTS), dtype=torch.float16)
+    def __init__(self, capacity: int, width: int) -> None:
+        self.observations = torch.empty((capacity, width), dtype=torch.float16)
+        self.actions = torch.empty((capacity, len(JOINTS.names)), dtype=torch.float16)
         self.size = 0
 
     def add(self, observations: np.ndarray, actions: np.ndarray) -> None:
@@ -197,20 +199,21 @@ class Collector:
     """Robots that run without end, driven by a mixture of teacher and student."""
 
     def __init__(
-        self, teacher: FalconLikePolicy, robots: int, threads: int, rng: np.random.Generator
+        self, teacher: Teacher, robots: int, threads: int, rng: np.random.Generator
     ) -> None:
         self.teacher, self.rng, self.robots = teacher, rng, robots
         morphology = make_morphology("g1")
         models = [randomise(build_model(morphology, "planning"), rng) for _ in range(robots)]
         self.simulation = BatchSimulation(models, morphology.standing_qpos(), threads)
-        self.memory = teacher.initial_memory(robots)
+        self.student = load_policy("default")  # its table says what is remembered and seen
+        self.memory = self.student.initial_memory(robots)
         self.noise = rng.uniform(0, 1, (robots, 1)) * (rng.uniform(size=(robots, 1)) < 0.6)  # noqa: PLR2004
         self.excitation: Excitation | None = None
         self.step = 0
         self.falls = 0
 
     def collect(
-        self, student: FalconLikePolicy | None, share: float, steps: int, experience: Experience
+        self, student: LowLevelPolicy | None, share: float, steps: int, experience: Experience
     ) -> None:
         """Run `steps` steps with the teacher's `share` and add them to `experience`."""
         simulation = self.simulation
@@ -231,7 +234,7 @@ class Collector:
                 random.mode[self.step],
             )
             taught = self.teacher.act(*inputs)
-            experience.add(taught.memory[:, NUM_JOINTS:], taught.memory[:, :NUM_JOINTS])
+            experience.add(self.student.observe(*inputs), taught.memory[:, ACTIONS])
             targets, self.memory = taught
             if student is not None and not teaches.all():
                 own = student.act(*inputs)
@@ -240,7 +243,7 @@ class Collector:
             simulation.step(targets, random.hand_force[self.step])
             down = simulation.fallen()
             simulation.reset(down)
-            self.memory[down] = np.zeros(MEMORY_SIZE)
+            self.memory[down] = self.student.initial_memory(int(down.sum()))
             self.falls += int(down.sum())
             self.step += 1
 
@@ -315,16 +318,17 @@ def distill(arguments: argparse.Namespace) -> Network:
     torch.set_num_threads(arguments.threads)
     generator = torch.Generator().manual_seed(arguments.seed)
     robots, steps = arguments.robots, arguments.steps
-    experience = Experience(arguments.rounds * robots * steps)
     collector = Collector(Teacher(arguments.teacher), robots, arguments.threads, rng)
+    width = collector.student.num_inputs
+    experience = Experience(arguments.rounds * robots * steps, width)
     start = time.monotonic()
     refines = arguments.init is not None
-    driver: FalconLikePolicy | None = Student(str(arguments.init)) if refines else None
+    driver = load_policy("default", str(arguments.init)) if refines else None
     network: Network | None = None
     for turn in range(arguments.rounds):
         share = 0.0 if refines else max(0.0, 1.0 - turn / max(1, 0.3 * arguments.rounds))
         collector.falls = 0
-        collector.collect(network or driver, share, steps, experience)
+        collector.collect(driver, share, steps, experience)
         if refines and turn < REFINE_AFTER:
             continue  # too little experience yet: training would forget more than it learns
         if network is None:
@@ -333,6 +337,7 @@ def distill(arguments: argparse.Namespace) -> Network:
             )
             if refines:
                 network.load(*load_weights(arguments.init))
+            driver = load_policy("default", network=network)
         rates = (3e-4, 1e-4) if refines else (1e-3, 3e-4)
         loss = train(network, experience, arguments.updates, rates, arguments.batch, generator)
         save_weights(arguments.out, *network.layers())  # a long run leaves something if cut off
@@ -388,8 +393,8 @@ def main() -> None:
         save_weights(arguments.out, *distill(arguments).layers())
         logger.info("wrote %s after %.0f s", arguments.out, time.monotonic() - start)
     report = compare_policies(
-        Falcon(arguments.teacher),
-        Student(str(arguments.out)),
+        load_policy("falcon", arguments.teacher),
+        load_policy("default", str(arguments.out)),
         seed=arguments.seed,
         trials=arguments.trials,
         seconds=arguments.seconds,

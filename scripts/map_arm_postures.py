@@ -18,7 +18,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.low_level.comparison import make_simulation, replace_table
-from xop_lerobot.low_level.falcon_observation import ARM, ARMS, LOWER_LIMITS, UPPER_LIMITS
+from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 
@@ -65,19 +65,21 @@ class Outcome:
 
 def make_named() -> np.ndarray:
     """The named postures. Shape (len(NAMED), 14)."""
-    rest = make_morphology("g1").rest_action().arms
-    postures = np.tile(rest, (len(NAMED), 1))
+    morphology = make_morphology("g1")
+    postures = np.tile(morphology.rest_action().arms, (len(NAMED), 1))
     for posture, angles in zip(postures, NAMED.values(), strict=True):
         for joint, angle in angles.items():
-            posture[ARM.index(joint)] = angle
             mirrored = joint.endswith(("roll", "yaw"))
-            posture[len(ARM) + ARM.index(joint)] = -angle if mirrored else angle
+            posture[morphology.arm_names.index(f"left_{joint}_joint")] = angle
+            right = morphology.arm_names.index(f"right_{joint}_joint")
+            posture[right] = -angle if mirrored else angle
     return postures
 
 
 def make_random(rng: np.random.Generator, n: int, span: float) -> np.ndarray:
     """Random postures over `span` of each joint's range. Shape (n, 14)."""
-    low, high = LOWER_LIMITS[ARMS], UPPER_LIMITS[ARMS]
+    joints = read_joints("g1")
+    low, high = joints.low[joints.arms], joints.high[joints.arms]
     return (low + high) / 2 + span * (high - low) / 2 * rng.uniform(-1, 1, (n, len(low)))
 
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from xop_lerobot.command import Mode
-from xop_lerobot.low_level.falcon_observation import LOWER_LIMITS, UPPER_LIMITS
+from xop_lerobot.low_level.joints import read_joints
 
 Network = Callable[..., np.ndarray]
 """Observation, shape (1, n) float32, to action, shape (1, m)."""
@@ -39,7 +39,7 @@ class Step(NamedTuple):
 
     Attributes:
         observation: What the network was shown, float32. Shape (n,).
-        targets: Motor targets, joints as `falcon_observation.JOINT_NAMES` [rad]. Shape (29,).
+        targets: Motor targets, in the order of the model [rad]. Shape (29,).
     """
 
     observation: np.ndarray
@@ -66,7 +66,7 @@ def compute_gravity(qpos: np.ndarray) -> list[float]:
 
 def clip_targets(targets: np.ndarray) -> np.ndarray:
     """Keep targets within the joint limits. Shape (29,) -> (29,)."""
-    return np.clip(targets, LOWER_LIMITS, UPPER_LIMITS)
+    return np.clip(targets, read_joints("g1").low, read_joints("g1").high)
 
 
 class PlainOpenWbtSquat:

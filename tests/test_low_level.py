@@ -14,31 +14,23 @@ import pytest
 import requests
 
 from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadShape, PolicyFileError, UnknownName
+from xop_lerobot.errors import BadShape, BadValue, PolicyFileError, UnknownName
 from xop_lerobot.low_level import policy_file
 from xop_lerobot.low_level.comparison import make_simulation, replace_table
 from xop_lerobot.low_level.diff_drive import DiffDrive, compute_wheel_speeds
 from xop_lerobot.low_level.excitation import ExcitationConfig, make_excitation
-from xop_lerobot.low_level.falcon import Falcon
-from xop_lerobot.low_level.falcon_observation import (
-    DEFAULT_POSTURE,
-    FRAME_SIZE,
-    JOINT_NAMES,
-    LOWER_LIMITS,
-    NUM_JOINTS,
-    UPPER_LIMITS,
-    build_observation,
-    compute_projected_gravity,
-    compute_targets,
-)
+from xop_lerobot.low_level.joints import read_joints
+from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
 from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput, make_policy
-from xop_lerobot.low_level.student import WEIGHTS_FILE, Student, load_weights, save_weights
+from xop_lerobot.low_level.tables import find_table, load_policy, read_table
 from xop_lerobot.low_level.trial import run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.transforms import quat_conjugate, quat_rotate
+from xop_lerobot.transforms import compute_projected_gravity, quat_conjugate, quat_rotate
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[1] / ".." / "shared"))
+FALCON_FILE = read_table(find_table("falcon")).networks["whole_body"].file
+WEIGHTS = find_table("default").parents[1] / "weights" / "g1_student.npz"
 STAND = np.array([0.75, 0, 0, 0, 0, 0, 0])
 
 
@@ -46,7 +38,7 @@ def find_teacher() -> str:
     """Return FALCON's file, or skip."""
     candidates = (
         SHARED / "reference" / "falcon" / "falcon_g1_29dof.onnx",
-        policy_file.falcon_cache_path(),
+        policy_file.cache_folder() / FALCON_FILE.name,
     )
     for file in candidates:
         if file.is_file():
@@ -133,16 +125,21 @@ def test_sizes(policy: LowLevelPolicy) -> None:
         policy.act(*inputs[:3], np.zeros((2, 3)), inputs[4], Mode.STATIONARY)
 
 
-def test_joint_tables_are_those_of_the_model() -> None:
-    """Order, limits and default posture are those of our G1."""
-    morphology = make_morphology("g1")
+def test_joints_are_those_of_the_model() -> None:
+    """Order, limits, groups and patterns of the joints."""
+    morphology, joints = make_morphology("g1"), read_joints("g1")
     model = build_model(morphology, "planning")
-    assert tuple(model.joint(i + 1).name for i in range(NUM_JOINTS)) == JOINT_NAMES
-    assert list(model.actuator_trnid[:, 0]) == list(range(1, NUM_JOINTS + 1))
-    np.testing.assert_allclose(model.jnt_range[1:, 0], LOWER_LIMITS, atol=1e-4)
-    np.testing.assert_allclose(model.jnt_range[1:, 1], UPPER_LIMITS, atol=1e-4)
-    np.testing.assert_allclose(morphology.standing_qpos()[7:22], DEFAULT_POSTURE[:15])
-    assert morphology.arm_names == JOINT_NAMES[15:]
+    assert joints.names == tuple(model.actuator(i).name for i in range(model.nu))
+    np.testing.assert_array_equal(joints.low, model.actuator_ctrlrange[:, 0])
+    np.testing.assert_array_equal(joints.high, model.actuator_ctrlrange[:, 1])
+    assert [joints.names[joint] for joint in joints.arms] == list(morphology.arm_names)
+    assert joints.select(["legs"]) == list(range(12))
+    assert joints.select(["waist", "right_knee_joint"]) == [12, 13, 14, 9]
+    assert joints.spread({"all": 1.0, "*_knee_joint": 2.0}, 0.0).sum() == 31
+    with pytest.raises(BadValue, match=r"'\*_toe' fits no joint. Groups: all, legs, waist, arms; "):
+        joints.select(["*_toe"])
+    with pytest.raises(BadValue, match="left_knee_joint is named twice by legs, left_knee_joint"):
+        joints.select(["legs", "left_knee_joint"])
 
 
 def test_projected_gravity_is_the_rotated_one() -> None:
@@ -153,53 +150,69 @@ def test_projected_gravity_is_the_rotated_one() -> None:
     np.testing.assert_allclose(compute_projected_gravity(quat), plain, atol=1e-12)
 
 
-def test_observation_frame() -> None:
-    """Each number of a frame is at its place, scaled; older frames move up."""
-    n = 2
-    qpos, qvel, command, arms, memory = make_inputs(Student(), n)
-    now = build_observation(qpos, qvel, command, arms, memory, Mode.MOBILE)
-    np.testing.assert_array_equal(now[:, :460], memory[:, NUM_JOINTS + FRAME_SIZE :])
+DEFAULT_LEGS = np.array([-0.1, 0, 0, 0.3, -0.2, 0] * 2)
+
+
+def test_observation_of_the_student() -> None:
+    """Each number of a frame is at its place, scaled; older frames come before it."""
+    policy = load_policy("default")
+    inputs = make_inputs(policy, 2)
+    qpos, qvel, command, arms, memory = inputs
+    now = policy.observe(*inputs, Mode.MOBILE)
+    assert now.shape == (2, 575)
+    np.testing.assert_allclose(now[:, :460], memory[:, 29:], rtol=1e-6)
     frame = now[:, 460:]
-    np.testing.assert_array_equal(frame[:, :29], memory[:, :29])
-    np.testing.assert_allclose(frame[:, 29:32], qvel[:, 3:6] / 4)
-    np.testing.assert_allclose(frame[:, 32:36], command[:, [6, 0, 4, 5]] * [1, 2, 1, 1])
+    np.testing.assert_allclose(frame[:, :29], memory[:, :29], rtol=1e-6)
+    np.testing.assert_allclose(frame[:, 29:32], qvel[:, 3:6] / 4, rtol=1e-6)
+    np.testing.assert_allclose(frame[:, 32:36], command[:, [6, 0, 4, 5]] * [1, 2, 1, 1], rtol=1e-6)
     assert (frame[:, 36] == 1).all()
-    np.testing.assert_allclose(frame[:, 37], command[:, 1])
-    angles = frame[:, 40:69] + DEFAULT_POSTURE
+    np.testing.assert_allclose(frame[:, 37], command[:, 1], rtol=1e-6)
+    angles = frame[:, 40:69].copy()
+    angles[:, :12] += DEFAULT_LEGS
     angles[:, 13:15] += command[:, 2:4]  # waist roll and pitch are relative to the command
-    np.testing.assert_allclose(angles, qpos[:, 7:], atol=1e-12)
-    np.testing.assert_allclose(frame[:, 69:98], qvel[:, 6:] / 20)
-    np.testing.assert_allclose(frame[:, 101:], arms)
-    stands = build_observation(qpos, qvel, command, arms, memory, Mode.STATIONARY)
-    assert (stands[:, 460 + 36] == 0).all()
+    np.testing.assert_allclose(angles, qpos[:, 7:], atol=1e-6)
+    np.testing.assert_allclose(frame[:, 69:98], qvel[:, 6:] / 20, rtol=1e-6)
+    np.testing.assert_allclose(frame[:, 101:], arms, rtol=1e-6)
+    assert (policy.observe(*inputs, Mode.STATIONARY)[:, 460 + 36] == 0).all()
 
 
-def test_memory_holds_the_last_five_frames_oldest_first() -> None:
-    """After k steps the memory is the last action and the frames of the last five steps."""
-    policy, frames = Student(), []
-    inputs = make_inputs(policy, 1)[:4]
-    targets, memory = np.empty(0), policy.initial_memory(1)
+class Says(LoadedNetwork):
+    """A network that always says the same."""
+
+    def __init__(self, value: float) -> None:
+        self.num_inputs, self.num_outputs, self._value = 575, 29, value
+
+    def __call__(
+        self, observation: np.ndarray, hidden: np.ndarray, past: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return np.full((len(observation), 29), self._value, np.float32), hidden
+
+
+def test_memory_holds_the_last_output_and_four_frames_oldest_first() -> None:
+    """After k steps the memory is the last output and the frames of the last four steps."""
+    policy, frames = load_policy("default"), []
+    memory = policy.initial_memory(1)
     for step in range(7):
         inputs = make_inputs(policy, 1, seed=step)[:4]
-        targets, memory = policy.act(*inputs, memory, Mode.STATIONARY)
-        frames.append(memory[0, -FRAME_SIZE:])
-    np.testing.assert_array_equal(memory[0, NUM_JOINTS:], np.concatenate(frames[-5:]))
-    plain = compute_targets(memory[:, :NUM_JOINTS], inputs[2], inputs[3])
-    np.testing.assert_allclose(targets, plain)
+        frames.append(policy.observe(*inputs, memory, Mode.STATIONARY)[0, -115:])
+        _, memory = policy.act(*inputs, memory, Mode.STATIONARY)
+    np.testing.assert_allclose(memory[0, 29:], np.concatenate(frames[-4:]), atol=1e-6)
 
 
 def test_targets_stay_within_the_limits_and_waist_tilt_is_direct() -> None:
-    """A wild action is clipped; waist roll and pitch get the commanded angle."""
-    command = np.array([[0.75, 0, 0.2, -0.3, 0, 0, 0]])
-    targets = compute_targets(np.full((1, 29), 80.0), command, np.zeros((1, 14)))
-    np.testing.assert_array_equal(np.delete(targets, [13, 14]), np.delete(UPPER_LIMITS, [13, 14]))
+    """A wild output is clipped; waist roll and pitch get the commanded angle."""
+    policy, joints = load_policy("default", network=Says(80.0)), read_joints("g1")
+    qpos, qvel, command, arms, memory = make_inputs(policy, 1)
+    command[:] = [0.75, 0, 0.2, -0.3, 0, 0, 0]
+    targets = policy.act(qpos, qvel, command, arms, memory, Mode.STATIONARY).targets
+    np.testing.assert_array_equal(np.delete(targets, [13, 14]), np.delete(joints.high, [13, 14]))
     np.testing.assert_array_equal(targets[0, 13:15], [0.2, -0.3])
 
 
 @pytest.mark.parametrize("name", ["default", "falcon"])
 def test_g1_stands_and_walks(name: str) -> None:
     """G1 stands for 4 s where it is, and walks for 4 s about as fast as asked."""
-    policy = Falcon(find_teacher()) if name == "falcon" else Student()
+    policy = make_policy(name, find_teacher() if name == "falcon" else None)
     simulation = make_simulation(2, threads=1)
     command = np.array([STAND, STAND + [0, 0, 0, 0, 0.5, 0, 0]])
     mode, memory = np.array([Mode.STATIONARY, Mode.MOBILE]), policy.initial_memory(2)
@@ -217,7 +230,7 @@ def test_g1_stands_and_walks(name: str) -> None:
 
 def test_g1_squats_and_leans() -> None:
     """The base follows the height, the waist its three angles."""
-    policy, simulation = Student(), make_simulation(2, threads=1)
+    policy, simulation = make_policy("default"), make_simulation(2, threads=1)
     final = np.array([[0.6, 0, 0, 0, 0, 0, 0], [0.75, 0.6, 0.15, 0.3, 0, 0, 0]])
     arms = np.tile(make_morphology("g1").rest_action().arms, (2, 1))
     memory = policy.initial_memory(2)
@@ -236,18 +249,13 @@ def test_g1_squats_and_leans() -> None:
 
 def test_trials_count_falls_and_errors() -> None:
     """A policy that holds still falls when pushed hard; the student does not when it is not."""
-
-    class Stiff(Student):
-        def infer(self, observation: np.ndarray) -> np.ndarray:
-            return np.zeros((len(observation), NUM_JOINTS), np.float32)
-
     rng = np.random.default_rng(0)
     hard = ExcitationConfig(push=2.0, push_period=0.5)
     excitation = make_excitation(rng, 4, 200, hard)
     simulation = make_simulation(4, threads=1)
-    assert run_trials(Stiff(), simulation, excitation).falls == 4  # noqa: PLR2004
+    assert run_trials(load_policy("default", network=Says(0.0)), simulation, excitation).falls == 4  # noqa: PLR2004
     easy = make_excitation(rng, 4, 200, ExcitationConfig(push=0.0, arm_range=0.2))
-    result = run_trials(Student(), simulation, easy)
+    result = run_trials(make_policy("default"), simulation, easy)
     assert result.falls == 0
     assert result.height_rmse < 0.05  # noqa: PLR2004
     assert result.planar_rmse < 0.4  # noqa: PLR2004
@@ -262,14 +270,16 @@ def test_excitation_is_reproducible_and_within_its_ranges() -> None:
     np.testing.assert_array_equal(first.push, again.push)
     assert first.command[..., 0].min() >= 0.5 and first.command[..., 0].max() <= 0.75  # noqa: PLR2004, PT018
     assert np.abs(first.command[..., 1]).max() <= config.waist_yaw
-    assert (first.arms >= LOWER_LIMITS[15:]).all() and (first.arms <= UPPER_LIMITS[15:]).all()  # noqa: PT018
+    joints = read_joints("g1")
+    assert (first.arms >= joints.low[15:]).all()
+    assert (first.arms <= joints.high[15:]).all()
     assert np.abs(first.push).max() > 0
 
 
 def test_shipped_weights_are_small() -> None:
     """At most 3 MB, float32."""
-    assert WEIGHTS_FILE.stat().st_size <= 3_000_000  # noqa: PLR2004
-    with np.load(WEIGHTS_FILE) as arrays:
+    assert WEIGHTS.stat().st_size <= 3_000_000  # noqa: PLR2004
+    with np.load(WEIGHTS) as arrays:
         assert {arrays[key].dtype for key in arrays.files} == {np.dtype("float32")}
 
 
@@ -278,7 +288,10 @@ def test_student_file_errors(tmp_path: Path) -> None:
     missing = tmp_path / "none.npz"
     with pytest.raises(PolicyFileError) as error:
         make_policy("default", str(missing))
-    assert str(error.value) == f"policy file '{missing}' does not exist"
+    assert str(error.value) == (
+        f"policy file '{missing}' does not exist. Give the default policy's g1_student.npz, or the "
+        "folder that holds it, with --robot.low_level.path=PATH, or no path"
+    )
     text = tmp_path / "text.npz"
     text.write_text("not weights")
     with pytest.raises(PolicyFileError, match="is not an .npz of arrays"):
@@ -288,9 +301,15 @@ def test_student_file_errors(tmp_path: Path) -> None:
     with pytest.raises(PolicyFileError) as error:
         make_policy("default", str(narrow))
     assert str(error.value) == (
-        f"policy file '{narrow}': layers must lead from 575 observations to 29 actions, "
-        "got matrices [(100, 29)]"
+        f"policy table '{find_table('default')}': network 'whole_body' with '{narrow}': the "
+        "network has 100 inputs, and its terms are 575 numbers: term past 460, term actions 29, "
+        "term angular_velocity 3, term commands 4, term walks 1, term commands 1, term constant 2, term "
+        "joint_positions 29, term joint_velocities 29, term gravity 3, term joint_targets 14"
     )
+    broken = tmp_path / "broken.npz"
+    save_weights(broken, [np.zeros((575, 4)), np.zeros((5, 29))], [np.zeros(4), np.zeros(29)])
+    with pytest.raises(PolicyFileError, match="each layer must take what the one before gives"):
+        make_policy("default", str(broken))
 
 
 def test_weights_round_trip(tmp_path: Path) -> None:
@@ -310,7 +329,7 @@ def write_onnx(file: Path, inputs: int) -> Path:
     """Write a one-layer network with a fixed batch of one."""
     import onnx  # noqa: PLC0415
 
-    from xop_lerobot.low_level.onnx_network import build_mlp  # noqa: PLC0415
+    from xop_lerobot.low_level.networks import build_mlp  # noqa: PLC0415
 
     model = build_mlp([np.zeros((inputs, 29), np.float32)], [np.zeros(29, np.float32)])
     for tensor in (*model.graph.input, *model.graph.output):
@@ -319,39 +338,50 @@ def write_onnx(file: Path, inputs: int) -> Path:
     return file
 
 
-def test_falcon_missing_path_is_named(tmp_path: Path) -> None:
+def test_missing_path_is_named(tmp_path: Path) -> None:
     """A path that leads nowhere is an error, no download."""
     missing = tmp_path / "falcon.onnx"
     with pytest.raises(PolicyFileError) as error:
         make_policy("falcon", str(missing))
     assert str(error.value) == (
-        f"policy file '{missing}' does not exist. Give FALCON's g1_29dof.onnx with "
-        "--robot.low_level.path=FILE, or no path to use the cached or downloaded one."
+        f"policy file '{missing}' does not exist. Give FALCON's falcon_g1_29dof.onnx, or the "
+        "folder that holds it, with --robot.low_level.path=PATH, or no path"
     )
 
 
-def test_falcon_offline_names_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_offline_names_three_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Absent and offline: the error says how to provide the file."""
 
     def refuse(*_: object, **__: object) -> None:
         raise requests.ConnectionError("no network")
 
-    monkeypatch.setattr(policy_file, "falcon_cache_path", lambda: tmp_path / "falcon.onnx")
+    monkeypatch.setattr(policy_file, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(requests, "get", refuse)
     with pytest.raises(PolicyFileError) as error:
         make_policy("falcon")
     assert str(error.value) == (
-        "FALCON's network is not on this machine and could not be downloaded (ConnectionError). "
-        "Three ways to provide it: (1) --robot.low_level.path=FILE with a copy of "
-        f"g1_29dof.onnx; (2) put it into the cache as '{tmp_path / 'falcon.onnx'}'; (3) be online "
-        f"once, it is downloaded from {policy_file.FALCON_URL}. "
-        "Or use --robot.low_level.name=default, which ships with the package."
+        "FALCON's falcon_g1_29dof.onnx is not on this machine and could not be downloaded "
+        "(ConnectionError). Three ways to provide it: (1) --robot.low_level.path=PATH with a copy "
+        "of falcon_g1_29dof.onnx, or its folder; (2) put it into the cache as "
+        f"'{tmp_path / FALCON_FILE.name}'; (3) be online once, it is downloaded from "
+        f"{FALCON_FILE.url}. Or use --robot.low_level.name=default, which ships with the package."
     )
 
 
-def test_falcon_downloaded_file_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_downloaded_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A policy whose files are published nowhere that we may fetch from."""
+    monkeypatch.setattr(policy_file, "cache_folder", lambda: tmp_path)
+    with pytest.raises(PolicyFileError) as error:
+        make_policy("amo")
+    assert str(error.value) == (
+        "AMO's amo_jit.pt is not on this machine, and it can't be downloaded. Two ways to provide "
+        "it: (1) --robot.low_level.path=PATH with a copy of amo_jit.pt, or its folder; (2) put it "
+        f"into the cache as '{tmp_path / 'amo' / 'amo_jit.pt'}'."
+    )
+
+
+def test_downloaded_file_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A download of another checksum is refused and not kept."""
-    original = policy_file.FALCON_SHA256
 
     class Answer:
         headers: dict[str, str] = {"content-length": "5"}  # noqa: RUF012
@@ -363,46 +393,46 @@ def test_falcon_downloaded_file_is_checked(tmp_path: Path, monkeypatch: pytest.M
         def iter_content(self, chunk_size: int) -> list[bytes]:
             return [b"wrong"]
 
-    monkeypatch.setattr(policy_file, "falcon_cache_path", lambda: tmp_path / "falcon.onnx")
+    monkeypatch.setattr(policy_file, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(requests, "get", lambda *_, **__: Answer())
-    with pytest.raises(PolicyFileError, match=f"does not have SHA-256 {original}"):
+    with pytest.raises(PolicyFileError, match=f"does not have SHA-256 {FALCON_FILE.sha256}"):
         make_policy("falcon")
-    assert not (tmp_path / "falcon.onnx").exists()
+    assert not (tmp_path / FALCON_FILE.name).exists()
 
 
-def test_falcon_altered_cache_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_altered_cache_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A cached file of another checksum is refused."""
-    cached = write_onnx(tmp_path / "falcon.onnx", 575)
-    monkeypatch.setattr(policy_file, "falcon_cache_path", lambda: cached)
+    cached = write_onnx(tmp_path / FALCON_FILE.name, 575)
+    monkeypatch.setattr(policy_file, "cache_folder", lambda: tmp_path)
     with pytest.raises(PolicyFileError) as error:
         make_policy("falcon")
     assert str(error.value) == (
         f"policy file '{cached}' has SHA-256 {policy_file.compute_sha256(cached)}, expected "
-        f"{policy_file.FALCON_SHA256}. Delete it, and it will be downloaded again."
+        f"{FALCON_FILE.sha256}. Delete it, and it will be downloaded again."
     )
 
 
-def test_falcon_given_file_of_other_checksum_is_used_with_a_warning(
+def test_given_file_of_other_checksum_is_used_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """One may train one's own FALCON; a fixed batch of one is made free."""
-    policy = Falcon(str(write_onnx(tmp_path / "own.onnx", 575)))
+    policy = make_policy("falcon", str(write_onnx(tmp_path / "own.onnx", 575)))
     assert "not that of the released FALCON" in caplog.text
-    assert policy.infer(np.zeros((4, 575), np.float32)).shape == (4, 29)
+    inputs = make_inputs(policy, 4)
+    assert policy.act(*inputs, Mode.MOBILE).targets.shape == (4, 29)
 
 
-def test_falcon_wrong_shape_or_format(tmp_path: Path) -> None:
-    """A network of other inputs, or a file that is no network, is named."""
+def test_wrong_shape_or_format(tmp_path: Path) -> None:
+    """A network of other inputs or outputs, or a file that is no network, is named."""
     wrong = write_onnx(tmp_path / "wrong.onnx", 47)
-    with pytest.raises(PolicyFileError) as error:
-        Falcon(str(wrong))
-    assert str(error.value) == (
-        f"policy file '{wrong}': expected one input of shape (batch, 575), got [(1, 47)]"
-    )
+    with pytest.raises(PolicyFileError, match="the network has 47 inputs, and its terms are 575"):
+        make_policy("falcon", str(wrong))
     text = tmp_path / "text.onnx"
     text.write_text("not a network")
     with pytest.raises(PolicyFileError, match="is not an ONNX model"):
-        Falcon(str(text))
+        make_policy("falcon", str(text))
+    with pytest.raises(PolicyFileError, match=r"must end in .npz, .onnx, .pt, got '.txt'"):
+        make_policy("falcon", str(text.rename(tmp_path / "text.txt")))
 
 
 def test_distillation_runs_from_a_teacher_file(tmp_path: Path) -> None:

@@ -15,8 +15,7 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
-from xop_lerobot.low_level.falcon_observation import FalconLikePolicy
-from xop_lerobot.low_level.policy import POLICY_DT
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.low_level.trial import BatchSimulation, run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -58,8 +57,8 @@ RESPONSES: dict[str, tuple[tuple[float, ...], Mode]] = {
 
 
 def compare_policies(  # noqa: PLR0913
-    teacher: FalconLikePolicy,
-    student: FalconLikePolicy,
+    teacher: LowLevelPolicy,
+    student: LowLevelPolicy,
     *,
     seed: int = 0,
     trials: int = 200,
@@ -116,7 +115,7 @@ def make_simulation(n: int, threads: int = 2) -> BatchSimulation:
     return BatchSimulation([model] * n, morphology.standing_qpos(), threads)
 
 
-def measure_responses(policy: FalconLikePolicy, threads: int = 2) -> dict[str, dict[str, float]]:
+def measure_responses(policy: LowLevelPolicy, threads: int = 2) -> dict[str, dict[str, float]]:
     """Hold each command of `RESPONSES` for 10 s after a ramp of 1 s, arms at rest, no pushes.
 
     Returns:
@@ -161,7 +160,7 @@ def measure_responses(policy: FalconLikePolicy, threads: int = 2) -> dict[str, d
 
 
 def measure_speeds(
-    policies: Mapping[str, FalconLikePolicy], repeats: int = 200
+    policies: Mapping[str, LowLevelPolicy], repeats: int = 200
 ) -> dict[str, dict[str, float]]:
     """Measure the median time of one `act` [ms], by policy and batch size.
 

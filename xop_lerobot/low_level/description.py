@@ -31,10 +31,16 @@ class Term(_Strict, frozen=True, tag_field="term"):
     Attributes:
         scale: Factors of its numbers.
         remembered: Whether the frames of the past hold it.
+        frames: How many times it is shown: as it was in the frames before, oldest first, and now.
     """
 
     scale: Numbers = 1.0
     remembered: bool = True
+    frames: Positive = 1
+
+
+class LinearVelocity(Term, frozen=True, tag="linear_velocity"):
+    """Velocity of the base, body frame [m/s]. 3 numbers."""
 
 
 class AngularVelocity(Term, frozen=True, tag="angular_velocity"):
@@ -140,7 +146,8 @@ class Past(_Strict, frozen=True, tag_field="term", tag="past"):
 
 
 type Seen = (
-    AngularVelocity | Gravity | RollPitch | HeadingError | JointPositions | JointVelocities
+    LinearVelocity
+    | AngularVelocity | Gravity | RollPitch | HeadingError | JointPositions | JointVelocities
     | JointTargets | Commands | Walks | Actions | Sine | Cosine | Constant | Reference
 )  # fmt: skip
 

@@ -7,13 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from xop_lerobot.command import Mode
-from xop_lerobot.low_level.falcon_observation import (
-    ARMS,
-    LOWER_LIMITS,
-    NUM_ARM_JOINTS,
-    NUM_COMMANDS,
-    UPPER_LIMITS,
-)
+from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.policy import POLICY_DT
 
 HEIGHT_NEUTRAL = 0.75
@@ -90,13 +84,13 @@ def make_excitation(
     high = np.concatenate([high, config.waist_pitch[1:], [config.vx, config.vy, config.yaw_rate]])
     neutral = np.array([HEIGHT_NEUTRAL, 0, 0, 0, 0, 0, 0])
     neutral[0] = min(neutral[0], config.height[1])
-    target = low + (high - low) * _hold(rng, n, steps, (1.0, 5.0), NUM_COMMANDS)
-    keep = _hold(rng, n, steps, (1.0, 5.0), NUM_COMMANDS) < 0.6  # noqa: PLR2004
+    target = low + (high - low) * _hold(rng, n, steps, (1.0, 5.0), low.size)
+    keep = _hold(rng, n, steps, (1.0, 5.0), low.size) < 0.6  # noqa: PLR2004
     target = np.where(keep, target, neutral)
     target[..., VELOCITIES] *= (mode == Mode.MOBILE)[..., None]
     slow = np.array([0.05, 0.3, 0.2, 0.2, 0.5, 0.5, 0.5])
     fast = np.array([0.5, 3.0, 1.0, 1.0, 5.0, 5.0, 5.0])
-    rate = slow * (fast / slow) ** _hold(rng, n, steps, (1.0, 5.0), NUM_COMMANDS)
+    rate = slow * (fast / slow) ** _hold(rng, n, steps, (1.0, 5.0), low.size)
     command = _follow(target, rate, np.tile(neutral, (n, 1)))
     arms = _make_arms(rng, n, steps, config)
     push = _make_pushes(rng, n, steps, config)
@@ -133,14 +127,15 @@ def _follow(target: np.ndarray, rate: np.ndarray, start: np.ndarray) -> np.ndarr
 def _make_arms(
     rng: np.random.Generator, n: int, steps: int, config: ExcitationConfig
 ) -> np.ndarray:
-    low, high = LOWER_LIMITS[ARMS], UPPER_LIMITS[ARMS]
+    joints = read_joints("g1")
+    low, high = joints.low[joints.arms], joints.high[joints.arms]
     middle, half = (low + high) / 2, (high - low) / 2
     target = middle + config.arm_range * half * (2 * _hold(rng, n, steps, (1, 4), 14) - 1)
     # Part of the time both arms rest, or all joints stay within a third of their range.
     posture = _hold(rng, n, steps, (3.0, 8.0))
     target = np.where(posture < 0.2, 0.0, np.where(posture < 0.6, target / 3, target))  # noqa: PLR2004
-    rate = config.arm_speed * (0.2 + 0.8 * _hold(rng, n, steps, (1, 4), NUM_ARM_JOINTS))
-    path = _follow(target, rate, np.zeros((n, NUM_ARM_JOINTS)))
+    rate = config.arm_speed * (0.2 + 0.8 * _hold(rng, n, steps, (1, 4), len(low)))
+    path = _follow(target, rate, np.zeros((n, len(low))))
     smooth = np.empty_like(path)
     now = path[0]
     for step in range(steps):  # no corners: a first-order lag of 0.1 s

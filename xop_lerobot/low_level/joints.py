@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cache
 
 import numpy as np
 
 from xop_lerobot.errors import BadValue
-from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.morphology import Morphology, make_morphology
 
 GROUPS = ("all", "legs", "waist", "arms")
 """Joints of the robot: all of them, in the model's order; those that neither a command nor an arm
@@ -118,6 +119,11 @@ class RobotJoints:
             spread[self.select([pattern])] = number
         return spread
 
+    @property
+    def arms(self) -> list[int]:
+        """Joints of the arms, in the order of the arm targets."""
+        return sorted(self.by_arm, key=lambda joint: self.by_arm[joint])
+
     def is_commanded(self, joint: int) -> bool:
         """Whether a command or an arm target is the angle of `joint`."""
         return joint in self.by_command or joint in self.by_arm
@@ -127,3 +133,9 @@ class RobotJoints:
             return fnmatchcase(self.names[joint], pattern)
         waist, arm = joint in self.by_command, joint in self.by_arm
         return {"all": True, "legs": not (waist or arm), "waist": waist, "arms": arm}[pattern]
+
+
+@cache
+def read_joints(robot: str) -> RobotJoints:
+    """The joints of a robot, by its name."""
+    return RobotJoints.of(make_morphology(robot))

@@ -16,7 +16,7 @@ from xop_lerobot.low_level.joints import RobotJoints
 from xop_lerobot.low_level.network_stage import NetworkStage, Situation
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
 from xop_lerobot.low_level.terms import FeatureColumns
-from xop_lerobot.transforms import compute_projected_gravity
+from xop_lerobot.transforms import compute_projected_gravity, quat_conjugate, quat_rotate
 
 if TYPE_CHECKING:
     import mujoco
@@ -126,10 +126,16 @@ class NetworkPolicy(LowLevelPolicy):
             self._slow[joints.find_command(entry)] = size
         self._has_slow = bool(table.stands_below)
         self._turns = joints.commands.index("yaw_rate") if "yaw_rate" in joints.commands else None
+        self._sees_velocity = any(stage.network.sees_velocity for stage in self._stages)
         self._waist, self._arms = _pair(joints.by_command), _pair(joints.by_arm)
         self.memory_size = sum(stage.network.memory_size for stage in self._stages)
         if len(self._stages) > 1:
             self.memory_size += 2 + 2 * len(joints.names)
+
+    @property
+    def num_inputs(self) -> int:
+        """Width of what the first network sees."""
+        return self._stages[0].network.num_inputs
 
     def adapt(self, model: mujoco.MjModel) -> None:
         """Give `model` the motors that the policy was trained with; see `LowLevelPolicy`."""
@@ -182,6 +188,24 @@ class NetworkPolicy(LowLevelPolicy):
         np.maximum(targets, joints.low, out=targets)
         return PolicyOutput(np.minimum(targets, joints.high, out=targets), after)
 
+    def observe(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        command: np.ndarray,
+        arms: np.ndarray,
+        memory: np.ndarray,
+        mode: Mode | np.ndarray,
+    ) -> np.ndarray:
+        """What the network of a policy with one network sees; arguments as in `act`.
+
+        Returns:
+            Observations, float32. Shape (n, num_inputs).
+        """
+        modes = np.broadcast_to(np.asarray(mode, dtype=int), (len(qpos),))
+        situation = self._look(qpos, qvel, command, arms, modes)
+        return self._stages[0].network.observe(situation, memory)[0]
+
     def _look(
         self,
         qpos: np.ndarray,
@@ -200,6 +224,9 @@ class NetworkPolicy(LowLevelPolicy):
         low, high = self._bounds
         command = np.minimum(np.maximum(command, low[which, modes]), high[which, modes])
         shared = np.zeros((len(qpos), columns.num_shared))
+        if self._sees_velocity:
+            velocity = quat_rotate(quat_conjugate(qpos[:, 3:7]), qvel[:, :3])
+            shared[:, columns["linear_velocity"]] = velocity
         shared[:, columns["angular_velocity"]] = qvel[:, 3:6]
         shared[:, columns["gravity"]] = compute_projected_gravity(qpos[:, 3:7])
         shared[:, columns["positions"]] = qpos[:, joints.positions]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +52,8 @@ class NetworkStage:
 
     Attributes:
         memory_size: Numbers that it remembers.
+        num_inputs: Width of the observation.
+        sees_velocity: Whether it sees how fast the base moves.
 
     Raises:
         BadValue: If the table does not fit the robot, or the network the table.
@@ -75,6 +78,7 @@ class NetworkStage:
         self._read_observation(table, reader)
         seen = [*table.sees, *(() if table.reference is None else table.reference.sees)]
         self._sees_heading = any(isinstance(term, d.HeadingError) for term in seen)
+        self.sees_velocity = any(isinstance(term, d.LinearVelocity) for term in seen)
         self._sees_tilt = any(isinstance(term, d.RollPitch) for term in seen)
         if reference is not None and table.reference is not None:
             self._reference_terms = reader.read(table.reference.sees)
@@ -110,38 +114,50 @@ class NetworkStage:
     def _read_observation(self, table: d.Network, reader: TermReader) -> None:
         """Decide where each number of now, and of the past, is in the observation."""
         now = [term for term in table.sees if not isinstance(term, d.Past)]
-        pasts = [term for term in table.sees if isinstance(term, d.Past)]
         self._terms = reader.read(now)
-        widths, kept, places = self._terms.widths, [], []
-        starts = np.concatenate([[0], np.cumsum(widths)]).astype(int)
-        for index, term in enumerate(now):
-            if term.remembered:
-                places.append(range(len(kept), len(kept) + widths[index]))
-                kept += range(starts[index], starts[index + 1])
+        starts = np.concatenate([[0], np.cumsum(self._terms.widths)]).astype(int)
+        spans = [range(*pair) for pair in zip(starts[:-1], starts[1:], strict=True)]
+        kept: list[int] = []  # what is remembered of a frame
+        places = []  # where each term is in what is remembered
+        for term, span in zip(now, spans, strict=True):
+            places.append(range(len(kept), len(kept) + len(span) * term.remembered))
+            kept += span if term.remembered else ()
         self._kept = np.array(kept, dtype=int)
         self._keeps_all = len(kept) == starts[-1]
         self._whole = table.whole_past or 0
-        self._num_frames = max([self._whole - 1, 0, *(term.frames for term in pasts)])
-        past = self._num_frames * len(kept)  # a row of the buffer is the past, then now
-        order: list[int] = []
-        sizes: list[str] = []
-        ranges = iter(zip(starts[:-1], starts[1:], strict=True))
-        for term in table.sees:
-            if isinstance(term, d.Past):
-                part = _order_past(term, self._num_frames, len(kept), places)
+        shown = [term.frames - (not isinstance(term, d.Past)) for term in table.sees]
+        self._num_frames = max([self._whole - 1, 0, *shown])
+        self._past_size, self._now_size = self._num_frames * len(kept), int(starts[-1])
+        order: list[int] = []  # in a row of the buffer, which is the past, then now
+        sizes, left = [], zip(now, spans, places, strict=True)
+        for each in table.sees:
+            if isinstance(each, d.Past):
+                groups = [range(len(kept))] if each.by == "frame" else places
+                part = self._find_past(each.frames, groups, newest=each.order == "newest first")
             else:
-                start, stop = next(ranges)
-                part = list(range(past + start, past + stop))
+                term, span, place = next(left)
+                if term.frames > 1 and not term.remembered:
+                    raise BadValue(f"{describe(term)} has frames, so it must be remembered")
+                part = self._find_past(term.frames - 1, [place], newest=False)
+                part += [self._past_size + column for column in span]
             order += part
-            sizes.append(f"{describe(term)} {len(part)}")
+            sizes.append(f"{describe(each)} {len(part)}")
         if self._network.num_inputs not in (None, len(order)):
             raise BadValue(
                 f"the network has {self._network.num_inputs} inputs, and its terms are "
                 f"{len(order)} numbers: {', '.join(sizes)}"
             )
-        self._past_size, self._now_size = past, int(starts[-1])
-        in_order = order == list(range(past + self._now_size))
+        self.num_inputs = len(order)
+        in_order = order == list(range(self._past_size + self._now_size))
         self._order = None if in_order else np.array(order, dtype=int)
+
+    def _find_past(self, count: int, groups: Sequence[range], *, newest: bool) -> list[int]:
+        """Columns of the last `count` frames of the past, group by group of what is kept."""
+        frames = list(range(self._num_frames - count, self._num_frames))  # oldest first
+        if newest:
+            frames.reverse()
+        size = len(self._kept)
+        return [frame * size + place for group in groups for frame in frames for place in group]
 
     def _lay_out_memory(self, num_phases: int, *, begins: bool) -> None:
         sizes = {
@@ -299,12 +315,3 @@ def compute_roll_pitch(quat: np.ndarray) -> np.ndarray:
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     return np.stack([roll, pitch], axis=1)
-
-
-def _order_past(term: d.Past, num_frames: int, size: int, places: list[range]) -> list[int]:
-    """Where in the buffer the numbers of the past are, in the order in which they are shown."""
-    frames = list(range(num_frames))[-term.frames :]  # oldest first
-    if term.order == "newest first":
-        frames.reverse()
-    groups = [range(size)] if term.by == "frame" else places
-    return [frame * size + place for group in groups for frame in frames for place in group]

@@ -74,8 +74,7 @@ class FileFinder:
         if not path.is_file():
             raise PolicyFileError(
                 f"policy file '{path}' does not exist. Give {self.title}'s {name}, or the folder "
-                "that holds it, with --robot.low_level.path=PATH; without a path the cached or "
-                "downloaded one is used."
+                "that holds it, with --robot.low_level.path=PATH, or no path"
             )
         if self.num_files > 1 and not given.is_dir():
             raise PolicyFileError(

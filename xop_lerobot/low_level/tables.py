@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -11,15 +11,16 @@ import msgspec
 import numpy as np
 
 from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, PolicyFileError
+from xop_lerobot.errors import BadValue, PolicyFileError, UnknownName
 from xop_lerobot.low_level import description as d
-from xop_lerobot.low_level.joints import RobotJoints
+from xop_lerobot.low_level import onnx_metadata
+from xop_lerobot.low_level.joints import RobotJoints, read_joints
 from xop_lerobot.low_level.network_policy import MotorSet, NetworkPolicy, Stage
 from xop_lerobot.low_level.network_stage import NetworkStage
-from xop_lerobot.low_level.networks import ReferenceNetwork, load_network
+from xop_lerobot.low_level.networks import LoadedNetwork, ReferenceNetwork, load_network
 from xop_lerobot.low_level.policy import POLICIES
 from xop_lerobot.low_level.policy_file import FileFinder
-from xop_lerobot.morphology.morphology import MORPHOLOGIES, make_morphology
+from xop_lerobot.morphology.morphology import list_robots
 
 logger = logging.getLogger(__name__)
 
@@ -34,8 +35,8 @@ def list_tables() -> tuple[str, ...]:
 
 
 def is_table(name: str) -> bool:
-    """Whether `name` is the path of a table, not the name of a policy."""
-    return name.endswith(SUFFIX)
+    """Whether `name` is the path of a table, or of weights that describe themselves."""
+    return name.endswith((SUFFIX, onnx_metadata.SUFFIX))
 
 
 def find_robot(name: str) -> str:
@@ -51,20 +52,27 @@ def find_table(name: str) -> Path:
     """The file of a table, by its name or its path.
 
     Raises:
+        UnknownName: If no table has this name.
         PolicyFileError: If there is no such file.
     """
-    file = Path(name).expanduser() if is_table(name) else FOLDER / f"{name}{SUFFIX}"
+    if not is_table(name):
+        if name not in list_tables():
+            raise UnknownName("policy table", name, list_tables())
+        return FOLDER / f"{name}{SUFFIX}"
+    file = Path(name).expanduser()
     if not file.is_file():
-        raise PolicyFileError(f"policy table '{file}' does not exist")
+        raise PolicyFileError(f"policy file '{file}' does not exist")
     return file
 
 
 def read_table(file: Path) -> d.PolicyTable:
-    """Read a table.
+    """Read a table: a TOML file, or what an ONNX file says of itself.
 
     Raises:
         PolicyFileError: If it is no TOML, or breaks the grammar of `description`; says where.
     """
+    if file.suffix == onnx_metadata.SUFFIX:
+        return onnx_metadata.make_table(file, _name_robot, read_table(find_table("holosoma")))
     try:
         return msgspec.toml.decode(file.read_bytes(), type=d.PolicyTable)
     except (msgspec.ValidationError, msgspec.DecodeError, UnicodeDecodeError) as error:
@@ -79,19 +87,28 @@ def _tag(term: type[msgspec.Struct]) -> str:
     return str(term.__struct_config__.tag)
 
 
-@cache
-def read_joints(robot: str) -> RobotJoints:
-    """The joints of a robot."""
-    return RobotJoints.of(make_morphology(robot))
+def _name_robot(names: tuple[str, ...]) -> str:
+    """The robot that has joints of these names.
+
+    Raises:
+        ValueError: If none has.
+    """
+    for robot in list_robots():
+        if set(names) <= set(read_joints(robot).names):
+            return robot
+    raise ValueError(f"names joints that no robot has: {', '.join(names)}")
 
 
-def load_policy(name: str, path: str | None = None) -> NetworkPolicy:
+def load_policy(
+    name: str, path: str | None = None, network: LoadedNetwork | None = None
+) -> NetworkPolicy:
     """Load the policy of a table.
 
     Args:
         name: Name of a table that ships with the package, or the path of one.
         path: Its file, or the folder of its files; None to look beside the table, in the cache,
             and where they are published.
+        network: What is run instead of all its files: a network in training.
 
     Raises:
         PolicyFileError: If the table or a file is missing or not what it should be.
@@ -99,27 +116,26 @@ def load_policy(name: str, path: str | None = None) -> NetworkPolicy:
     file = find_table(name)
     table = read_table(file)
     try:
-        return _build(name if name in list_tables() else file.stem, file, table, path)
+        return _build(name if name in list_tables() else file.stem, file, table, path, network)
     except BadValue as error:
         raise PolicyFileError(f"policy table '{file}': {error}") from error
 
 
-def _build(name: str, file: Path, table: d.PolicyTable, path: str | None) -> NetworkPolicy:
-    if table.robot not in MORPHOLOGIES:
-        make_morphology(table.robot)  # says which robots there are
+def _build(
+    name: str, file: Path, table: d.PolicyTable, path: str | None, network: LoadedNetwork | None
+) -> NetworkPolicy:
     joints = read_joints(table.robot)
-    parts = {part: _load_part(part, file, table, path) for part in _parts(table)}
+    names = {table.stationary, table.mobile}
+    parts = {part: _load_part(part, file, table, path, network) for part in names}
     return NetworkPolicy(name, table, joints, parts[table.stationary], parts[table.mobile])
 
 
-def _parts(table: d.PolicyTable) -> set[str]:
-    return {table.stationary, table.mobile}
-
-
-def _load_part(part: str, file: Path, table: d.PolicyTable, path: str | None) -> Stage:
+def _load_part(
+    part: str, file: Path, table: d.PolicyTable, path: str | None, own: LoadedNetwork | None
+) -> Stage:
     """A network of this table, or the one of another policy that runs in the same mode."""
     if part in table.networks:
-        return _load_stage(part, file, table, path)
+        return _load_stage(part, file, table, path, own)
     other = find_table(part if not is_table(part) else str(file.parent / part))
     theirs = read_table(other)
     if theirs.robot != table.robot:
@@ -128,16 +144,18 @@ def _load_part(part: str, file: Path, table: d.PolicyTable, path: str | None) ->
     network = theirs.find_part(mode)
     if network not in theirs.networks:
         raise BadValue(f"{part} has no network of its own for this mode: it names '{network}'")
-    return _load_stage(network, other, theirs, path)
+    return _load_stage(network, other, theirs, path, own)
 
 
-def _load_stage(name: str, file: Path, table: d.PolicyTable, path: str | None) -> Stage:
+def _load_stage(
+    name: str, file: Path, table: d.PolicyTable, path: str | None, own: LoadedNetwork | None
+) -> Stage:
     joints, network = read_joints(table.robot), table.networks[name]
-    files = _list_files(table)
     given = None if path is None else Path(path).expanduser()
-    finder = FileFinder(table.title, file.parent, given, len(files))
+    finder = FileFinder(table.title, file.parent, given, len(_list_files(table)))
     _say_terms(table)
-    weights = load_network(finder.find(network.file))
+    weights_file = "a network in training" if own else finder.find(network.file)
+    weights = own or load_network(Path(weights_file))
     reference = None
     if network.reference is not None:
         statistics = network.reference.statistics
@@ -149,7 +167,7 @@ def _load_stage(name: str, file: Path, table: d.PolicyTable, path: str | None) -
     try:
         stage = NetworkStage(network, joints, weights, reference)
     except BadValue as error:
-        raise BadValue(f"network '{name}': {error}") from error
+        raise BadValue(f"network '{name}' with '{weights_file}': {error}") from error
     return Stage(stage, MotorSet.read(table.motors, joints), low, high)
 
 

@@ -36,6 +36,7 @@ class FeatureColumns:
     ) -> None:
         num_joints = len(joints.names)
         sizes = {
+            "linear_velocity": 3,
             "angular_velocity": 3,
             "gravity": 3,
             "positions": num_joints,
@@ -176,6 +177,7 @@ class TermReader:
 
 
 _FEATURES: Mapping[type, str] = {
+    d.LinearVelocity: "linear_velocity",
     d.AngularVelocity: "angular_velocity",
     d.Gravity: "gravity",
     d.RollPitch: "roll_pitch",

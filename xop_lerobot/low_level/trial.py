@@ -11,14 +11,8 @@ from mujoco import rollout
 
 from xop_lerobot.command import Mode
 from xop_lerobot.low_level.excitation import Excitation
-from xop_lerobot.low_level.falcon_observation import (
-    NQ,
-    NV,
-    FalconLikePolicy,
-    compute_projected_gravity,
-)
-from xop_lerobot.low_level.policy import POLICY_DT
-from xop_lerobot.transforms import quat_rotate, quat_yaw
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+from xop_lerobot.transforms import compute_projected_gravity, quat_rotate, quat_yaw
 
 FALL_HEIGHT = 0.35
 """Base height under which a robot counts as fallen [m]."""
@@ -50,18 +44,18 @@ class BatchSimulation:
         self._rollout = rollout.Rollout(nthread=threads)
         self._hands = [model.body(name).id for name in hands]
         self._spec = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
-        self.state = np.zeros((len(models), 1 + NQ + NV))
+        self.state = np.zeros((len(models), 1 + model.nq + model.nv))
         self.reset(np.ones(len(models), bool))
 
     @property
     def qpos(self) -> np.ndarray:
         """Generalised positions. Shape (n, nq), a view."""
-        return self.state[:, 1 : 1 + NQ]
+        return self.state[:, 1 : 1 + self._model.nq]
 
     @property
     def qvel(self) -> np.ndarray:
         """Generalised velocities. Shape (n, nv), a view."""
-        return self.state[:, 1 + NQ :]
+        return self.state[:, 1 + self._model.nq :]
 
     def reset(self, which: np.ndarray) -> None:
         """Put the robots `which` (n,) back at the start, at rest."""
@@ -144,7 +138,7 @@ class TrialResult:
 
 
 def run_trials(
-    policy: FalconLikePolicy, simulation: BatchSimulation, excitation: Excitation
+    policy: LowLevelPolicy, simulation: BatchSimulation, excitation: Excitation
 ) -> TrialResult:
     """Run `policy` on every sequence of `excitation`, one robot each, and judge it."""
     steps, n, _ = excitation.command.shape

@@ -164,12 +164,18 @@ class Morphology(ABC):
 MORPHOLOGIES: Registry[type[Morphology]] = Registry("robot")
 
 
+def list_robots() -> tuple[str, ...]:
+    """Names of the known robots."""
+    from xop_lerobot.morphology import g1, rby1  # noqa: F401, PLC0415
+
+    return tuple(MORPHOLOGIES)
+
+
 def make_morphology(name: str) -> Morphology:
     """Make the robot `name`.
 
     Raises:
         UnknownName: Listing the known robots.
     """
-    from xop_lerobot.morphology import g1, rby1  # noqa: F401, PLC0415
-
+    list_robots()
     return MORPHOLOGIES[name]()
