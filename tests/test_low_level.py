@@ -303,8 +303,8 @@ def test_student_file_errors(tmp_path: Path) -> None:
     assert str(error.value) == (
         f"policy table '{find_table('default')}': network 'whole_body' with '{narrow}': the "
         "network has 100 inputs, and its terms are 575 numbers: term past 460, term actions 29, "
-        "term angular_velocity 3, term commands 4, term walks 1, term commands 1, term constant 2, term "
-        "joint_positions 29, term joint_velocities 29, term gravity 3, term joint_targets 14"
+        "term angular_velocity 3, term commands 4, term walks 1, term commands 1, term constant 2, "
+        "term joint_positions 29, term joint_velocities 29, term gravity 3, term joint_targets 14"
     )
     broken = tmp_path / "broken.npz"
     save_weights(broken, [np.zeros((575, 4)), np.zeros((5, 29))], [np.zeros(4), np.zeros(29)])
