@@ -1,7 +1,7 @@
 r"""Distil FALCON's G1 policy into the student that ships with the package.
 
     python scripts/distill_low_level.py --teacher g1_29dof.onnx --seed 0 \
-        --out xop_lerobot/low_level/weights/g1_student.npz --report student.json
+        --out xop_lerobot/low_level/weights/g1_student.npz
 
 DAgger (Ross et al., 2011): many robots run in the planning model; each is driven by the teacher
 or by the student, the teacher's share falls from one to zero, and the student is trained on
@@ -14,7 +14,6 @@ FALCON are compared on the same random sequences.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import time
 from dataclasses import fields
@@ -28,7 +27,6 @@ from torch import nn
 from xop_lerobot.command import Mode
 from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import BadValue
-from xop_lerobot.low_level.comparison import compare_policies, replace_table, write_table
 from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
@@ -361,15 +359,12 @@ def distill(arguments: argparse.Namespace) -> Network:
 def parse_arguments() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(
-        description="Distil FALCON's G1 policy into a smaller network and compare the two.",
+        description="Distil FALCON's G1 policy into a smaller network.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--teacher", help="FALCON's ONNX file; None: cached or downloaded")
-    parser.add_argument("--seed", type=int, default=0, help="seed of training and comparison")
+    parser.add_argument("--seed", type=int, default=0, help="seed of training")
     parser.add_argument("--out", type=Path, required=True, help="weights of the student, .npz")
-    parser.add_argument("--report", type=Path, help="comparison, JSON")
-    parser.add_argument("--docs", type=Path, help="Markdown page whose table is to be replaced")
-    parser.add_argument("--evaluate-only", action="store_true", help="compare, do not train")
     parser.add_argument("--hidden", type=int, nargs="+", default=[384, 192], help="layer widths")
     parser.add_argument("--init", type=Path, help="weights of a student to train further, .npz")
     parser.add_argument("--rounds", type=int, default=24, help="rounds of DAgger")
@@ -378,34 +373,17 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--updates", type=int, default=300, help="gradient steps a round")
     parser.add_argument("--final-updates", type=int, default=8000, help="gradient steps at last")
     parser.add_argument("--batch", type=int, default=1024, help="samples a gradient step")
-    parser.add_argument("--trials", type=int, default=200, help="sequences of the comparison")
-    parser.add_argument("--seconds", type=float, default=20.0, help="length of a sequence [s]")
     parser.add_argument("--threads", type=int, default=2, help="threads")
     return parser.parse_args()
 
 
 def main() -> None:
-    """Train, unless told otherwise, and compare."""
+    """Train and save."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     arguments = parse_arguments()
     start = time.monotonic()
-    if not arguments.evaluate_only:
-        save_weights(arguments.out, *distill(arguments).layers())
-        logger.info("wrote %s after %.0f s", arguments.out, time.monotonic() - start)
-    report = compare_policies(
-        load_policy("falcon", arguments.teacher),
-        load_policy("default", str(arguments.out)),
-        seed=arguments.seed,
-        trials=arguments.trials,
-        seconds=arguments.seconds,
-        threads=arguments.threads,
-    )
-    table = write_table(report)
-    logger.info("%s", table)
-    if arguments.report:
-        arguments.report.write_text(json.dumps(report, indent=2) + "\n")
-    if arguments.docs:
-        replace_table(arguments.docs, table)
+    save_weights(arguments.out, *distill(arguments).layers())
+    logger.info("wrote %s after %.0f s", arguments.out, time.monotonic() - start)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import requests
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadShape, BadValue, PolicyFileError, UnknownName
 from xop_lerobot.low_level import policy_file
-from xop_lerobot.low_level.comparison import make_simulation, replace_table
+from xop_lerobot.low_level.comparison import make_simulation
 from xop_lerobot.low_level.diff_drive import DiffDrive, compute_wheel_speeds
 from xop_lerobot.low_level.excitation import ExcitationConfig, make_excitation
 from xop_lerobot.low_level.joints import read_joints
@@ -435,20 +435,46 @@ def test_wrong_shape_or_format(tmp_path: Path) -> None:
         make_policy("falcon", str(text.rename(tmp_path / "text.txt")))
 
 
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
 def test_distillation_runs_from_a_teacher_file(tmp_path: Path) -> None:
-    """The script makes loadable weights and a whole report."""
-    script = Path(__file__).parents[1] / "scripts" / "distill_low_level.py"
-    out, report = tmp_path / "student.npz", tmp_path / "report.json"
-    small = "--robots 8 --steps 20 --updates 3 --final-updates 2 --batch 32 --trials 2 --seconds 1"
-    common = [sys.executable, str(script), "--teacher", find_teacher(), *small.split()]
-    command = [*common, "--rounds", "1", "--out", str(out), "--report", str(report)]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    facts = json.loads(report.read_text())
-    assert facts["trials"] == 2  # noqa: PLR2004
-    assert set(facts["teacher"]) == set(facts["student"])
-    assert facts["act_ms"]["student"]["30"] > 0
+    """The script makes loadable weights."""
+    out = tmp_path / "student.npz"
+    small = "--robots 8 --steps 20 --updates 3 --final-updates 2 --batch 32 --rounds 1"
+    script = str(SCRIPTS / "distill_low_level.py")
+    command = [sys.executable, script, "--teacher", find_teacher(), *small.split()]
+    subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, timeout=300)
     weights, _ = load_weights(out)
     assert [w.shape for w in weights] == [(575, 384), (384, 192), (192, 29)]
+
+
+def test_benchmark_of_policies_writes_a_table(tmp_path: Path) -> None:
+    """Policies side by side; what the file of results holds is not run again."""
+    page, results = tmp_path / "page.md", tmp_path / "results.json"
+    page.write_text("a\n<!-- policies -->\nold\n<!-- end of policies -->\nb\n")
+    script = str(SCRIPTS / "benchmark_policies.py")
+    command = [sys.executable, script, "--trials", "2", "--seconds", "1", "--json", str(results)]
+    command += ["--policies", "default", str(find_table("default")), "--docs", str(page)]
+    for parts in ("sequences", "speed,sequences"):
+        done = subprocess.run(
+            [*command, "--parts", parts], check=True, capture_output=True, text=True, timeout=300
+        )
+    assert "sequences done" not in done.stderr
+    facts = json.loads(results.read_text())
+    assert facts["default"] == facts[str(find_table("default"))] | {
+        "speed": facts["default"]["speed"]
+    }
+    table = page.read_text()
+    assert "| | default | " in table
+    assert "| the published ranges | 0 · " in table
+    assert "| batch of 30 | " in table
+    wrong = subprocess.run(
+        [*command, "--parts", "spead"], check=False, capture_output=True, text=True, timeout=300
+    )
+    assert wrong.stderr == (
+        "error: unknown part 'spead'. Known: arms, commands, mpc, sequences, speed\n"
+    )
 
 
 def test_wheel_speeds_by_hand() -> None:
@@ -502,11 +528,3 @@ def test_diff_drive_takes_no_file() -> None:
     with pytest.raises(PolicyFileError) as error:
         make_policy("diff_drive", "x.onnx")
     assert str(error.value) == "low-level policy 'diff_drive' has no file, got 'x.onnx'"
-
-
-def test_table_goes_between_the_marks(tmp_path: Path) -> None:
-    """Only what is between the marks of a page is replaced."""
-    page = tmp_path / "page.md"
-    page.write_text("a\n<!-- comparison -->\nold\n<!-- end of comparison -->\nb\n")
-    replace_table(page, "new\n")
-    assert page.read_text() == "a\n<!-- comparison -->\nnew\n<!-- end of comparison -->\nb\n"

@@ -1,118 +1,114 @@
-"""Student against teacher: the same random sequences, some plain commands, and speed."""
+"""What G1 policies do alone: held commands, postures of the arms, random sequences, speed."""
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import mujoco
 import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
+from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
-from xop_lerobot.low_level.trial import BatchSimulation, run_trials
+from xop_lerobot.low_level.trial import BatchSimulation, TrialResult, run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.transforms import quat_yaw
 
-COMPARISON_SEED = 1_000_000
-"""Added to the seed, so that no sequence of the comparison was trained on."""
-
-MEASURES = {
-    "falls": "falls",
-    "height_rmse": "height RMSE, stance [m]",
-    "vx_rmse": "vx RMSE, walking [m/s]",
-    "vy_rmse": "vy RMSE, walking [m/s]",
-    "planar_rmse": "planar velocity RMSE, walking [m/s]",
-    "yaw_rate_rmse": "yaw rate RMSE, walking [rad/s]",
-    "waist_yaw_rmse": "waist yaw RMSE, stance [rad]",
-}
-"""Measures of a comparison and what they are called in its table."""
+SEQUENCES_SEED = 1_000_000
+"""Added to the seed, so that no sequence of a comparison was trained on."""
 
 STAND, WALK = Mode.STATIONARY, Mode.MOBILE
 RESPONSES: dict[str, tuple[tuple[float, ...], Mode]] = {
     "stand": ((0.75, 0, 0, 0, 0, 0, 0), STAND),
     "stand at 0.70 m": ((0.70, 0, 0, 0, 0, 0, 0), STAND),
     "stand at 0.60 m": ((0.60, 0, 0, 0, 0, 0, 0), STAND),
-    "stand at 0.55 m": ((0.55, 0, 0, 0, 0, 0, 0), STAND),
     "stand at 0.50 m": ((0.50, 0, 0, 0, 0, 0, 0), STAND),
+    "stand at 0.42 m": ((0.42, 0, 0, 0, 0, 0, 0), STAND),
     "waist yaw 0.8": ((0.75, 0.8, 0, 0, 0, 0, 0), STAND),
     "waist roll 0.3": ((0.75, 0, 0.3, 0, 0, 0, 0), STAND),
-    "waist pitch 0.3": ((0.75, 0, 0, 0.3, 0, 0, 0), STAND),
     "waist pitch 0.5": ((0.75, 0, 0, 0.5, 0, 0, 0), STAND),
     "waist pitch -0.3": ((0.75, 0, 0, -0.3, 0, 0, 0), STAND),
-    "step in place": ((0.75, 0, 0, 0, 0, 0, 0), WALK),
+    "0.45 m and pitch 0.5": ((0.45, 0, 0, 0.5, 0, 0, 0), STAND),
+    "zero velocity": ((0.75, 0, 0, 0, 0, 0, 0), WALK),
     "walk 0.5 m/s": ((0.75, 0, 0, 0, 0.5, 0, 0), WALK),
     "walk -0.5 m/s": ((0.75, 0, 0, 0, -0.5, 0, 0), WALK),
     "sidestep 0.4 m/s": ((0.75, 0, 0, 0, 0, 0.4, 0), WALK),
     "turn 0.6 rad/s": ((0.75, 0, 0, 0, 0, 0, 0.6), WALK),
+    "walk 0.4 m/s at 0.60 m": ((0.60, 0, 0, 0, 0.4, 0, 0), WALK),
 }
 """Plain commands, held for 10 s: name -> command, mode."""
 
+SEQUENCES = {
+    "calm arms, no push": ExcitationConfig(arm_range=0.3, push=0.0),
+    "the published ranges": ExcitationConfig(),
+    "pushes of 1.0 m/s": ExcitationConfig(arm_range=0.3, push=1.0),
+    "lean 0.3 rad, low, 20 N at the hands": ExcitationConfig(
+        height=(0.45, 0.75), waist_roll=0.3, waist_pitch=(-0.3, 0.3), push=0.0, hand_force=20.0
+    ),
+}
+"""Random sequences by name."""
 
-def compare_policies(  # noqa: PLR0913
-    teacher: LowLevelPolicy,
-    student: LowLevelPolicy,
+ARMS: dict[str, dict[str, float]] = {
+    "palms up": {"wrist_roll": 1.9},
+    "palms out": {"wrist_roll": -1.6},
+    "overhead": {"shoulder_pitch": -2.8, "elbow": 0.8},
+    "behind the back": {
+        "shoulder_pitch": 0.9, "shoulder_yaw": -0.5, "elbow": 1.2, "wrist_roll": 1.0,
+    },
+    "crossed": {"shoulder_pitch": -0.8, "shoulder_yaw": 1.0, "elbow": 0.3},
+    "to the sides": {"shoulder_roll": 1.5, "elbow": 1.4},
+}  # fmt: skip
+"""What people do with their arms: angles of the left arm [rad], from rest; the right mirrors it."""
+
+RAMP_S, HOLD_S, SETTLE_S = 1.5, 8.0, 0.8
+FAR = 0.1
+"""Distance from which a robot that was told to stand counts as having moved [m]."""
+SPEED = 0.4
+"""Forward velocity of the walks with held arms [m/s]."""
+
+
+def make_simulation(
+    n: int, threads: int = 2, policy: LowLevelPolicy | None = None
+) -> BatchSimulation:
+    """Make `n` G1 in the planning model, at their standing posture, with a policy's motors."""
+    morphology = make_morphology("g1")
+    model = build_model(morphology, "planning")
+    if policy is not None:
+        policy.adapt(model)
+    return BatchSimulation([model] * n, morphology.standing_qpos(), threads)
+
+
+def measure_sequences(
+    policy: LowLevelPolicy,
+    config: ExcitationConfig,
     *,
     seed: int = 0,
     trials: int = 200,
     seconds: float = 20.0,
     threads: int = 2,
-    config: ExcitationConfig | None = None,
-) -> dict[str, Any]:
-    """Compare two G1 policies on our planning model.
+) -> TrialResult:
+    """Run random sequences.
 
     Args:
-        teacher: The one to compare with.
-        student: The one that is compared.
-        seed: Seed of the random sequences.
+        policy: The policy.
+        config: Ranges of the sequences.
+        seed: Seed of the sequences.
         trials: Number of sequences.
         seconds: Length of each [s].
         threads: Threads of the simulation.
-        config: Ranges of the sequences, None for the published ones.
-
-    Returns:
-        A report of plain numbers, texts and dictionaries.
     """
-    config = config or ExcitationConfig()
-    policies = {"teacher": teacher, "student": student}
-    rng = np.random.default_rng(COMPARISON_SEED + seed)
+    rng = np.random.default_rng(SEQUENCES_SEED + seed)
     excitation = make_excitation(rng, trials, round(seconds / POLICY_DT), config)
-    results = {
-        name: run_trials(policy, make_simulation(trials, threads), excitation)
-        for name, policy in policies.items()
-    }
-    return {
-        "seed": seed,
-        "trials": trials,
-        "seconds": seconds,
-        "ranges": asdict(config),
-        "mujoco": mujoco.__version__,
-        "machine": f"{platform.machine()}, {platform.system()}",
-        **{name: asdict(result) for name, result in results.items()},
-        "ratio": _ratios(asdict(results["student"]), asdict(results["teacher"])),
-        "responses": {
-            name: measure_responses(policy, threads) for name, policy in policies.items()
-        },
-        "act_ms": measure_speeds(policies),
-    }
-
-
-def _ratios(student: Mapping[str, float], teacher: Mapping[str, float]) -> dict[str, float]:
-    return {key: student[key] / teacher[key] for key in MEASURES if key.endswith("rmse")}
-
-
-def make_simulation(n: int, threads: int = 2) -> BatchSimulation:
-    """Make `n` G1 in the planning model, at their standing posture."""
-    morphology = make_morphology("g1")
-    model = build_model(morphology, "planning")
-    return BatchSimulation([model] * n, morphology.standing_qpos(), threads)
+    simulation = make_simulation(trials, threads, policy)
+    try:
+        return run_trials(policy, simulation, excitation)
+    finally:
+        simulation.close()
 
 
 def measure_responses(policy: LowLevelPolicy, threads: int = 2) -> dict[str, dict[str, float]]:
@@ -135,7 +131,7 @@ def measure_responses(policy: LowLevelPolicy, threads: int = 2) -> dict[str, dic
         np.zeros((steps, n, 2)),
         np.zeros((steps, n, 2, 3)),
     )
-    simulation = make_simulation(n, threads)
+    simulation = make_simulation(n, threads, policy)
     memory, down = policy.initial_memory(n), np.zeros(n, bool)
     heights, velocities, poses = [], [], []
     for step in range(steps):
@@ -148,6 +144,7 @@ def measure_responses(policy: LowLevelPolicy, threads: int = 2) -> dict[str, dic
         heights.append(simulation.qpos[:, 2].copy())
         velocities.append(simulation.velocity())
         poses.append(np.column_stack([simulation.qpos[:, :2], quat_yaw(simulation.qpos[:, 3:7])]))
+    simulation.close()
     travel = np.linalg.norm(poses[-1][:, :2] - poses[ramp][:, :2], axis=1)
     turn = np.sum(velocities[ramp:], axis=0)[:, 2] * POLICY_DT
     height, velocity = (np.mean(values[-mean_steps:], axis=0) for values in (heights, velocities))
@@ -157,6 +154,91 @@ def measure_responses(policy: LowLevelPolicy, threads: int = 2) -> dict[str, dic
         name: {key: float(column[row]) for key, column in columns.items()}
         for row, name in enumerate(RESPONSES)
     }
+
+
+@dataclass(frozen=True)
+class HeldArms:
+    """What has become of robots that hold their arms in a posture each.
+
+    Attributes:
+        fell: Which fell. Shape (n,), bool.
+        travel: How far each is from where it stood [m], NaN if it fell. Shape (n,).
+        velocity: Mean velocity forward, left [m/s] and yaw rate [rad/s]. Shape (n, 3).
+    """
+
+    fell: np.ndarray
+    travel: np.ndarray
+    velocity: np.ndarray
+
+    @property
+    def strayed(self) -> np.ndarray:
+        """Which moved by more than `FAR`. Shape (n,), bool."""
+        return ~self.fell & (self.travel > FAR)
+
+
+def make_named_arms() -> np.ndarray:
+    """The postures `ARMS`. Shape (len(ARMS), 14)."""
+    morphology = make_morphology("g1")
+    postures = np.tile(morphology.rest_action().arms, (len(ARMS), 1))
+    for posture, angles in zip(postures, ARMS.values(), strict=True):
+        for joint, angle in angles.items():
+            mirrored = joint.endswith(("roll", "yaw"))
+            posture[morphology.arm_names.index(f"left_{joint}_joint")] = angle
+            right = morphology.arm_names.index(f"right_{joint}_joint")
+            posture[right] = -angle if mirrored else angle
+    return postures
+
+
+def make_random_arms(
+    policy: LowLevelPolicy, rng: np.random.Generator, n: int, span: float
+) -> np.ndarray:
+    """Random postures over `span` of each joint's range, within the policy's limits. (n, 14)."""
+    joints, names = read_joints("g1"), make_morphology("g1").arm_names
+    low, high = joints.low[joints.arms], joints.high[joints.arms]
+    arms = (low + high) / 2 + span * (high - low) / 2 * rng.uniform(-1, 1, (n, len(low)))
+    for joint, (least, most) in policy.arm_limits.items():
+        column = names.index(joint)
+        arms[:, column] = np.clip(arms[:, column], least, most)
+    return arms
+
+
+def hold_arms(
+    policy: LowLevelPolicy, arms: np.ndarray, mode: Mode, height: float = 0.75, threads: int = 2
+) -> HeldArms:
+    """Stand or walk with the arms in a posture each: 1.5 s on the way there, 8 s in all.
+
+    Args:
+        policy: The policy.
+        arms: Postures. Shape (n, 14).
+        mode: Stationary to stand, mobile to walk at `SPEED`.
+        height: Commanded height of the pelvis [m].
+        threads: Threads of the simulation.
+    """
+    n, rest = len(arms), make_morphology("g1").rest_action().arms
+    final = np.array([height, 0, 0, 0, SPEED * (mode is Mode.MOBILE), 0, 0])
+    settle, ramp = round(SETTLE_S / POLICY_DT), round(RAMP_S / POLICY_DT)
+    lead = settle + round(abs(height - 0.75) / 0.25 / POLICY_DT)
+    simulation = make_simulation(n, threads, policy)
+    memory, up = policy.initial_memory(n), np.ones(n, bool)
+    start, velocities = np.zeros((n, 2)), []
+    for step in range(lead + round(HOLD_S / POLICY_DT)):
+        if step == lead:
+            start = simulation.qpos[:, :2].copy()
+        command = final.copy()
+        command[0] = 0.75 + min(step / max(lead, 1), 1.0) * (height - 0.75)
+        share = np.clip((step - lead) / ramp, 0, 1)
+        targets, memory = policy.act(
+            simulation.qpos, simulation.qvel, np.tile(command, (n, 1)),
+            (1 - share) * rest + share * arms, memory, mode,
+        )  # fmt: skip
+        simulation.step(targets)
+        up &= ~simulation.fallen()
+        simulation.reset(~up)
+        if step >= lead + ramp:
+            velocities.append(simulation.velocity())
+    travel = np.linalg.norm(simulation.qpos[:, :2] - start, axis=1)
+    simulation.close()
+    return HeldArms(~up, np.where(up, travel, np.nan), np.mean(velocities, axis=0))
 
 
 def measure_speeds(
@@ -187,41 +269,7 @@ def measure_speeds(
     return result
 
 
-def write_table(report: Mapping[str, Any]) -> str:
-    """Write a report as Markdown tables."""
-    teacher, student = report["teacher"], report["student"]
-    lines = [
-        f"{report['trials']} random sequences of {report['seconds']:g} s, seed {report['seed']}, "
-        f"MuJoCo {report['mujoco']}, planning model:",
-        "",
-        "| | FALCON | student | ratio |",
-        "|---|---|---|---|",
-    ]
-    for key, label in MEASURES.items():
-        ratio = f"{report['ratio'][key]:.2f}" if key in report["ratio"] else ""
-        numbers = (f"{values[key]:.3f}".removesuffix(".000") for values in (teacher, student))
-        lines.append(f"| {label} | {' | '.join(numbers)} | {ratio} |")
-    for n, slow in report["act_ms"]["teacher"].items():
-        fast = report["act_ms"]["student"][n]
-        lines.append(
-            f"| one call, batch of {n} [ms] | {slow:.2f} | {fast:.2f} | {fast / slow:.2f} |"
-        )
-    lines += [
-        "",
-        "Plain commands, held for 10 s (FALCON / student); means over the last 5 s:",
-        "",
-        "| command | travel [m] | turn [rad] | height [m] | vx [m/s] | vy [m/s] | "
-        "yaw rate [rad/s] | falls |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, one in report["responses"]["teacher"].items():
-        two = report["responses"]["student"][name]
-        cells = [f"{one[key]:z.2f} / {two[key]:z.2f}" for key in one if key != "falls"]
-        lines.append(f"| {name} | {' | '.join(cells)} | {one['falls']:g} / {two['falls']:g} |")
-    return "\n".join(lines) + "\n"
-
-
-def replace_table(page: Path, table: str, mark: str = "comparison") -> None:
+def replace_table(page: Path, table: str, mark: str) -> None:
     """Replace what stands between the two marks of a Markdown page by `table`.
 
     The marks are the comments ``mark`` and ``end of mark``.

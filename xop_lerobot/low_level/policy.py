@@ -47,7 +47,7 @@ class LowLevelPolicy(ABC):
     memory_size: int
     arm_limits: Mapping[str, tuple[float, float]] = {}
     """Angles within which arm targets are kept, by joint, where the robot does not stand or walk
-    safely beyond [rad]; `scripts/map_arm_postures.py` tells."""
+    safely beyond [rad]; `scripts/benchmark_policies.py` tells."""
 
     def adapt(self, model: mujoco.MjModel) -> None:
         """Give `model`, of a plant or of rollouts, the motors that the policy was trained with.

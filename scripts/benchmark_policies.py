@@ -1,0 +1,284 @@
+"""Compare G1's low-level policies, alone and under the model predictive controller.
+
+    python scripts/benchmark_policies.py --policies default falcon openwbt=FOLDER
+    python scripts/benchmark_policies.py --policies all=FOLDER --docs docs/low_level.md \
+        --json outputs/policies.json
+
+A policy is a name, the path of a table of your own, or either with its file or folder behind `=`.
+Parts: `speed` of one call; plain `commands` held for 10 s; `arms` held anywhere; random
+`sequences`; `mpc`, the scenarios of scripts/benchmark_tracking.py with the policy in the planner's
+rollouts. What a JSON file holds already is not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.command import Mode
+from xop_lerobot.command_line import make_output_readable
+from xop_lerobot.errors import UnknownName, XopError
+from xop_lerobot.evaluation.tracking import run_trial
+from xop_lerobot.evaluation.tracking_setup import TrackingSetup
+from xop_lerobot.low_level.comparison import (
+    ARMS,
+    FAR,
+    RESPONSES,
+    SEQUENCES,
+    SPEED,
+    hold_arms,
+    make_named_arms,
+    make_random_arms,
+    measure_responses,
+    measure_sequences,
+    measure_speeds,
+    replace_table,
+)
+from xop_lerobot.low_level.policy import LowLevelPolicy, list_policies, make_policy
+from xop_lerobot.morphology.morphology import make_morphology
+
+PARTS = ("speed", "commands", "arms", "sequences", "mpc")
+HEIGHTS = (0.75, 0.55, 0.45)
+"""Heights of the pelvis at which arms are held [m]."""
+SCENARIOS = ("squat", "yaw", "pitch", "diagonal", "sideways", "quarter", "curve", "arms")
+"""Scenarios under the controller."""
+
+type Results = dict[str, dict[str, Any]]
+"""Figures by policy and part."""
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--policies", nargs="+", default=["default"], help="NAME, NAME=PATH, or all=FOLDER")
+    add("--parts", default=",".join(PARTS), help="with commas between (default: all)")
+    add("--trials", type=int, default=100, help="sequences, postures (default: 100)")
+    add("--seconds", type=float, default=20.0, help="length of a sequence [s] (default: 20)")
+    add("--seeds", type=int, default=3, help="seeds under the controller (default: 3)")
+    add("--scenarios", default=",".join(SCENARIOS), help="under the controller")
+    add("--seed", type=int, default=0, help="the first seed (default: 0)")
+    add("--threads", type=int, default=2, help="threads of the simulation (default: 2)")
+    add("--json", type=Path, help="figures, added to what the file holds")
+    add("--docs", type=Path, help="Markdown page whose table is to be replaced")
+    return parser.parse_args()
+
+
+def find_policies(words: Iterable[str]) -> dict[str, str | None]:
+    """Names of policies and their paths; of ``all`` those whose files are there."""
+    found: dict[str, str | None] = {}
+    for word in words:
+        name, _, path = word.partition("=")
+        if name != "all":
+            found[name] = path or None
+            continue
+        for each in list_policies(make_morphology("g1")):
+            for place in (path or None, None):
+                try:
+                    make_policy(each, place)
+                except XopError:
+                    continue
+                found[each] = place
+                break
+    return found
+
+
+def run_part(
+    part: str, name: str, path: str | None, policy: LowLevelPolicy, arguments: argparse.Namespace
+) -> Any:
+    """Run one part with one policy."""
+    trials, seed, threads = arguments.trials, arguments.seed, arguments.threads
+    if part == "commands":
+        return measure_responses(policy, threads)
+    if part == "sequences":
+        return {
+            title: asdict(
+                measure_sequences(
+                    policy,
+                    config,
+                    seed=seed,
+                    trials=trials,
+                    seconds=arguments.seconds,
+                    threads=threads,
+                )
+            )
+            for title, config in SEQUENCES.items()
+        }
+    if part == "arms":
+        return measure_arms(policy, trials, seed, threads)
+    return {
+        scenario: [
+            run_trial(
+                TrackingSetup("g1", scenario, low_level=name, low_level_path=path or ""), each
+            )
+            for each in range(seed, seed + arguments.seeds)
+        ]
+        for scenario in arguments.scenarios.split(",")
+    }
+
+
+def measure_arms(policy: LowLevelPolicy, trials: int, seed: int, threads: int) -> dict[str, Any]:
+    """Hold arms in the postures that people take, and in random ones over 90 % of the ranges."""
+    named = hold_arms(policy, make_named_arms(), Mode.STATIONARY, threads=threads)
+    figures: dict[str, Any] = {
+        name: None if fell else float(travel)
+        for name, fell, travel in zip(ARMS, named.fell, named.travel, strict=True)
+    }
+    arms = make_random_arms(policy, np.random.default_rng(seed), trials, 0.9)
+    for height in HEIGHTS:
+        stood = hold_arms(policy, arms, Mode.STATIONARY, height, threads)
+        figures[f"stand at {height:g} m"] = {
+            "fell": int(stood.fell.sum()),
+            "moved": int(stood.strayed.sum()),
+            "median": float(np.nanmedian(stood.travel)) if not stood.fell.all() else None,
+        }
+    walked = hold_arms(policy, arms, Mode.MOBILE, threads=threads)
+    velocity = walked.velocity[~walked.fell]
+    figures["walk"] = {
+        "fell": int(walked.fell.sum()),
+        "error": float((velocity[:, 0] - SPEED).mean()) if len(velocity) else None,
+        "turn": float(np.abs(velocity[:, 2]).mean()) if len(velocity) else None,
+    }
+    return figures
+
+
+def run_all(policies: Mapping[str, str | None], arguments: argparse.Namespace) -> Results:
+    """Run what is missing in the file of results, and return all of it."""
+    file: Path | None = arguments.json
+    kept = json.loads(file.read_text()) if file is not None and file.is_file() else {}
+    results: Results = {name: kept.get(name, {}) for name in policies}
+    made = {name: make_policy(name, path) for name, path in policies.items()}
+    for part in arguments.parts.split(","):
+        if part not in PARTS:
+            raise UnknownName("part", part, PARTS)
+        missing = [name for name in policies if part not in results[name]]
+        if part == "speed" and missing:
+            for name, speeds in measure_speeds(made).items():
+                results[name][part] = speeds
+        for name in missing if part != "speed" else ():
+            results[name][part] = run_part(part, name, policies[name], made[name], arguments)
+            print(f"{name}: {part} done", file=sys.stderr, flush=True)
+            if file is not None:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_text(json.dumps(kept | results, indent=1) + "\n")
+    return results
+
+
+def write_table(results: Results, arguments: argparse.Namespace) -> str:
+    """Write the figures as Markdown tables, a column a policy."""
+    lines = [
+        f"Planning model, MuJoCo {mujoco.__version__}; {arguments.trials} random sequences of "
+        f"{arguments.seconds:g} s and {arguments.trials} postures a row, seed {arguments.seed}; "
+        f"under the controller mild noise, {arguments.seeds} seeds, median / worst.",
+    ]
+    writers: dict[str, tuple[str, Callable[[Any], dict[str, str]]]] = {
+        "commands": ("Plain commands, held for 10 s", _write_commands),
+        "arms": (f"Arms held for 8 s; random ones over 90 % of the ranges, {FAR} m is moved",
+                 _write_arms),
+        "sequences": ("Random sequences: falls · height RMSE in stance [m] · planar velocity RMSE "
+                      "[m/s] · yaw rate RMSE [rad/s]", _write_sequences),
+        "mpc": ("Under the controller: head's 95th percentile after arrival, of the curve its mean "
+                "[cm] (falls)", _write_mpc),
+        "speed": ("One call [ms]", _write_speed),
+    }  # fmt: skip
+    for part, (title, write) in writers.items():
+        columns = {name: write(figures[part]) for name, figures in results.items()
+                   if part in figures}  # fmt: skip
+        if not columns:
+            continue
+        rows = list(next(iter(columns.values())))
+        lines += ["", f"{title}:", "", f"| | {' | '.join(columns)} |"]
+        lines.append("|---|" + "---|" * len(columns))
+        for row in rows:
+            cells = (column.get(row, "") for column in columns.values())
+            lines.append(f"| {row} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _write_commands(figures: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
+    cells = {}
+    for name, one in figures.items():
+        walks = RESPONSES[name][1] is Mode.MOBILE
+        if one["falls"]:
+            cells[name] = "falls"
+        elif walks:
+            cells[name] = f"{one['vx']:z.2f}, {one['vy']:z.2f}, {one['yaw_rate']:z.2f}"
+        else:
+            cells[name] = f"{one['height']:.2f} m, moved {one['travel']:.2f}"
+    return cells
+
+
+def _write_arms(figures: Mapping[str, Any]) -> dict[str, str]:
+    cells = {
+        f"{name}: moved [m]": "falls" if figures[name] is None else f"{figures[name]:.2f}"
+        for name in ARMS
+    }
+    for height in HEIGHTS:
+        one = figures[f"stand at {height:g} m"]
+        median = "" if one["median"] is None else f", {one['median']:.2f}"
+        cells[f"random, {height:g} m: fell, moved, median [m]"] = (
+            f"{one['fell']}, {one['moved']}{median}"
+        )
+    walk = figures["walk"]
+    numbers = "" if walk["turn"] is None else f", {walk['error']:+.2f}, {walk['turn']:.2f}"
+    name = f"random, walking at {SPEED} m/s: fell, error [m/s], unasked turn [rad/s]"
+    cells[name] = f"{walk['fell']}{numbers}"
+    return cells
+
+
+def _write_sequences(figures: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
+    keys = ("height_rmse", "planar_rmse", "yaw_rate_rmse")
+    return {
+        name: " · ".join([f"{one['falls']:g}", *(f"{one[key]:.3f}" for key in keys)])
+        for name, one in figures.items()
+    }
+
+
+def _write_mpc(figures: Mapping[str, list[Mapping[str, Any]]]) -> dict[str, str]:
+    cells = {}
+    for scenario, runs in figures.items():
+        key = next(
+            key for key in ("after_p95_cm", "moving_mean_cm", "p95_cm") if key in runs[0]["metrics"]
+        )
+        values = [run["metrics"][key] for run in runs]
+        falls = sum(bool(run["metrics"]["falls"]) for run in runs)
+        told = f" ({falls})" if falls else ""
+        cells[scenario] = f"{np.median(values):.1f} / {max(values):.1f}{told}"
+    return cells
+
+
+def _write_speed(figures: Mapping[str, float]) -> dict[str, str]:
+    return {f"batch of {n}": f"{ms:.2f}" for n, ms in figures.items()}
+
+
+def main() -> int:
+    """Run the benchmark; returns the exit code."""
+    arguments = parse_arguments()
+    try:
+        results = run_all(find_policies(arguments.policies), arguments)
+    except XopError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    table = write_table(results, arguments)
+    print(table)
+    if arguments.docs:
+        replace_table(arguments.docs, table, "policies")
+    return 0
+
+
+if __name__ == "__main__":
+    make_output_readable()
+    sys.exit(main())
