@@ -165,16 +165,23 @@ def run_all(policies: Mapping[str, str | None], arguments: argparse.Namespace) -
         if part not in PARTS:
             raise UnknownName("part", part, PARTS)
         missing = [name for name in policies if part not in results[name]]
-        if part == "speed" and missing:
+        if part == "speed" and missing:  # side by side, so all anew
             for name, speeds in measure_speeds(made).items():
                 results[name][part] = speeds
-        for name in missing if part != "speed" else ():
+            missing = []
+        for name in missing:
             results[name][part] = run_part(part, name, policies[name], made[name], arguments)
             print(f"{name}: {part} done", file=sys.stderr, flush=True)
-            if file is not None:
-                file.parent.mkdir(parents=True, exist_ok=True)
-                file.write_text(json.dumps(kept | results, indent=1) + "\n")
+            save(arguments.json, kept | results)
+    save(arguments.json, kept | results)
     return results
+
+
+def save(file: Path | None, results: Results) -> None:
+    """Write all figures, where a file is named."""
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(results, indent=1) + "\n")
 
 
 def write_table(results: Results, arguments: argparse.Namespace) -> str:

@@ -17,6 +17,14 @@ GROUPS = ("all", "legs", "waist", "arms")
 target names; those that a command names; those of the arms."""
 
 
+def as_index(places: Sequence[int] | np.ndarray) -> slice | np.ndarray:
+    """What picks columns: a slice where they follow each other, which costs nothing."""
+    places = np.asarray(places, dtype=int)
+    if len(places) and np.array_equal(places, np.arange(places[0], places[0] + len(places))):
+        return slice(int(places[0]), int(places[-1]) + 1)
+    return places
+
+
 @dataclass(frozen=True)
 class RobotJoints:
     """Actuated joints of a robot, in the order of the model's actuators.

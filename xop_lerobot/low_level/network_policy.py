@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadShape, BadValue
 from xop_lerobot.low_level import description as d
-from xop_lerobot.low_level.joints import RobotJoints
+from xop_lerobot.low_level.joints import RobotJoints, as_index
 from xop_lerobot.low_level.network_stage import NetworkStage, Situation
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
 from xop_lerobot.low_level.terms import FeatureColumns
@@ -128,6 +127,10 @@ class NetworkPolicy(LowLevelPolicy):
         self._turns = joints.commands.index("yaw_rate") if "yaw_rate" in joints.commands else None
         self._sees_velocity = any(stage.network.sees_velocity for stage in self._stages)
         self._waist, self._arms = _pair(joints.by_command), _pair(joints.by_arm)
+        self._angles, self._speeds = as_index(joints.positions), as_index(joints.velocities)
+        self._low = np.stack([stage.low for stage in self._stages])
+        self._high = np.stack([stage.high for stage in self._stages])
+        self._has_ranges = bool(np.isfinite([self._low, self._high]).any())
         self.memory_size = sum(stage.network.memory_size for stage in self._stages)
         if len(self._stages) > 1:
             self.memory_size += 2 + 2 * len(joints.names)
@@ -215,22 +218,23 @@ class NetworkPolicy(LowLevelPolicy):
         modes: np.ndarray,
     ) -> Situation:
         """What the networks may see."""
-        columns, joints = self._columns, self._joints
+        columns = self._columns
         walks = modes == Mode.MOBILE
         stands = ~walks
         if self._has_slow:
             stands = stands | (np.abs(command) < self._slow).all(axis=1)
-        which = 0 if len(self._stages) == 1 else np.where(stands, 0, 1)
-        low, high = self._bounds
-        command = np.minimum(np.maximum(command, low[which, modes]), high[which, modes])
+        if self._has_ranges:
+            which = 0 if len(self._stages) == 1 else np.where(stands, 0, 1)
+            low, high = self._low[which, modes], self._high[which, modes]
+            command = np.minimum(np.maximum(command, low), high)
         shared = np.zeros((len(qpos), columns.num_shared))
         if self._sees_velocity:
             velocity = quat_rotate(quat_conjugate(qpos[:, 3:7]), qvel[:, :3])
             shared[:, columns["linear_velocity"]] = velocity
         shared[:, columns["angular_velocity"]] = qvel[:, 3:6]
         shared[:, columns["gravity"]] = compute_projected_gravity(qpos[:, 3:7])
-        shared[:, columns["positions"]] = qpos[:, joints.positions]
-        shared[:, columns["velocities"]] = qvel[:, joints.velocities]
+        shared[:, columns["positions"]] = qpos[:, self._angles]
+        shared[:, columns["velocities"]] = qvel[:, self._speeds]
         targets = shared[:, columns["targets"]]
         targets[:, self._waist[0]] = command[:, self._waist[1]]
         targets[:, self._arms[0]] = arms[:, self._arms[1]]
@@ -238,14 +242,6 @@ class NetworkPolicy(LowLevelPolicy):
         shared[:, columns["walks"]] = walks[:, None]
         yaw_rate = np.zeros(len(qpos)) if self._turns is None else command[:, self._turns]
         return Situation(shared, stands, qpos[:, 3:7], yaw_rate)
-
-    @cached_property
-    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Commands that each network is asked for in each mode. Shapes (stages, 2, k)."""
-        return (
-            np.stack([stage.low for stage in self._stages]),
-            np.stack([stage.high for stage in self._stages]),
-        )
 
     def _run(
         self, index: int, situation: Situation, memory: np.ndarray
@@ -303,9 +299,9 @@ class NetworkPolicy(LowLevelPolicy):
         return targets, later
 
 
-def _pair(mapping: Mapping[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _pair(mapping: Mapping[int, int]) -> tuple[slice | np.ndarray, slice | np.ndarray]:
     """Joints, and where their targets come from."""
-    return np.array(list(mapping), dtype=int), np.array(list(mapping.values()), dtype=int)
+    return as_index(list(mapping)), as_index(list(mapping.values()))
 
 
 def check_batch(name: str, array: np.ndarray, n: int, size: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from xop_lerobot.errors import BadValue
 from xop_lerobot.low_level import description as d
 from xop_lerobot.low_level.clock import GaitClock
-from xop_lerobot.low_level.joints import RobotJoints
+from xop_lerobot.low_level.joints import RobotJoints, as_index
 from xop_lerobot.low_level.networks import LoadedNetwork, ReferenceNetwork
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.low_level.terms import FeatureColumns, TermReader, describe, spread_over
@@ -102,14 +102,18 @@ class NetworkStage:
         unused, residual = joints.select(action.discard), joints.select(action.residual)
         scale = spread_over(action.scale, joints, outputs, len(outputs), "action")
         self._outputs, self._clip = outputs, action.clip
-        self._used = np.array([row for row, joint in enumerate(outputs) if joint not in unused])
-        self._moved = np.array(outputs)[self._used]
-        self._scale = scale[self._used]
-        self._adds = np.isin(self._moved, residual)
-        self._centre = np.where(self._adds, 0.0, self._default[self._moved])
+        used = np.array([row for row, joint in enumerate(outputs) if joint not in unused])
+        moved = np.array(outputs)[used]
+        self._used, self._moved = as_index(used), as_index(moved)
+        self._scale = scale[used]
+        self._added = as_index(np.flatnonzero(np.isin(moved, residual)))
+        self._base = as_index(moved[self._added])  # joints to whose command outputs are added
+        self._centre = self._default[moved]
+        self._centre[self._added] = 0.0
         held = joints.select(action.hold)
         free = [not joints.is_commanded(joint) for joint in range(len(joints.names))]
-        self._resting = np.flatnonzero(np.isin(range(len(joints.names)), held) | free)
+        resting = np.flatnonzero(np.isin(range(len(joints.names)), held) | free)
+        self._resting, self._postures = as_index(resting), self._default[resting]
 
     def _read_observation(self, table: d.Network, reader: TermReader) -> None:
         """Decide where each number of now, and of the past, is in the observation."""
@@ -203,10 +207,8 @@ class NetworkStage:
         after[:, self._places["actions"]] = actions
         after[:, self._places["hidden"]] = hidden
         targets = self._rest(situation)
-        moved = actions if len(self._used) == len(self._outputs) else actions[:, self._used]
-        moved = self._centre + self._scale * moved
-        if self._adds.any():
-            moved[:, self._adds] += targets[:, self._moved[self._adds]]
+        moved = self._centre + self._scale * actions[:, self._used]
+        moved[:, self._added] += targets[:, self._base]
         targets[:, self._moved] = moved
         return targets, after
 
@@ -225,9 +227,10 @@ class NetworkStage:
             The memory after the step.
         """
         _, _, after = self.observe(situation, memory)
-        base = np.where(self._adds, self._rest(situation)[:, self._moved], self._centre)
+        moved = targets[:, self._moved] - self._centre
+        moved[:, self._added] -= self._rest(situation)[:, self._base]
         outputs = np.zeros((len(targets), len(self._outputs)))
-        outputs[:, self._used] = (targets[:, self._moved] - base) / self._scale
+        outputs[:, self._used] = moved / self._scale
         if self._clip is not None:
             outputs = np.clip(outputs, -self._clip, self._clip)
         after[:, self._places["actions"]] = outputs
@@ -277,7 +280,7 @@ class NetworkStage:
     def _rest(self, situation: Situation) -> np.ndarray:
         """Targets of joints that no output moves. Shape (n, nu)."""
         targets = situation.shared[:, self._columns["targets"]].copy()
-        targets[:, self._resting] = self._default[self._resting]
+        targets[:, self._resting] = self._postures
         return targets
 
     def _compute_features(
