@@ -67,6 +67,47 @@ def test_mobile_entries_go_to_neutral_at_their_rate_in_stationary_mode():
     np.testing.assert_array_equal(SPACE.limit(walking, None, 0.1, Mode.STATIONARY), [0.7, 0.0])
 
 
+SQUATTING = SPACE.fit(
+    {Mode.STATIONARY: {"height": (0.4, 0.78)}, Mode.MOBILE: {"height": (0.7, 0.78)}}, {"vx": 0.2}
+)
+"""What is left of the space with a policy that squats standing, and has a dead zone walking."""
+
+
+def test_a_policy_narrows_the_bounds_by_mode():
+    assert SQUATTING.low.tolist() == [0.5, -1.0]  # the robot's own bound is narrower
+    assert SQUATTING.high.tolist() == [0.78, 1.0]
+    assert SQUATTING.dims[0].neutral == 0.75
+    low = np.array([0.3, 0.0])
+    np.testing.assert_array_equal(SQUATTING.restrict(low, Mode.STATIONARY), [0.5, 0.0])
+    np.testing.assert_array_equal(SQUATTING.restrict(low, Mode.MOBILE), [0.7, 0.0])
+    np.testing.assert_array_equal(SPACE.restrict(low, Mode.MOBILE), [0.5, 0.0])
+    rising = SQUATTING.limit(low, np.array([0.5, 0.0]), 0.1, Mode.MOBILE)
+    np.testing.assert_allclose(rising, [0.55, 0.0])  # at the rate, from wherever it is
+    assert SQUATTING.fit(SQUATTING.ranges, SQUATTING.dead_zones).dims == SQUATTING.dims
+    longer = SQUATTING.extend((CommandDim("elbow", "elbow.pos", "rad", -1, 1, 0, 1),))
+    np.testing.assert_array_equal(longer.bounds(Mode.MOBILE)[0], [0.7, -1.0, -1.0])
+
+
+def test_ranges_that_do_not_fit_the_robot_are_named():
+    with pytest.raises(BadValue) as error:
+        SPACE.fit({Mode.MOBILE: {"height": (0.2, 0.4)}}, {})
+    assert str(error.value) == (
+        "command 'height' is 0.5 to 0.8 m for this robot, and the policy's range in mobile mode is "
+        "0.2 to 0.4"
+    )
+    with pytest.raises(UnknownName):
+        SPACE.fit({Mode.MOBILE: {"high": (0.2, 0.4)}}, {})
+
+
+def test_planned_velocities_leave_a_dead_zone_by_its_nearer_end():
+    for planned, acts in ((0.05, 0.0), (-0.05, 0.0), (0.15, 0.2), (-0.15, -0.2), (0.3, 0.3)):
+        got = SQUATTING.leave_dead_zones(np.array([0.75, planned]), Mode.MOBILE)
+        np.testing.assert_array_equal(got, [0.75, acts])
+    slow = np.array([0.75, 0.15])
+    np.testing.assert_array_equal(SQUATTING.leave_dead_zones(slow, Mode.STATIONARY), slow)
+    np.testing.assert_array_equal(SQUATTING.restrict(slow, Mode.MOBILE), slow)
+
+
 SWAYING = CommandSpace(
     (
         CommandDim("height", "height.pos", "m", 0.5, 0.8, 0.75, 0.5),

@@ -161,3 +161,33 @@ def test_mistakes():
         CommandDim("x", "x.pos", "m", 0, 1, 0.5, 1, max_accel=0)
     with pytest.raises(BadValue, match="command 'x' must have low <= neutral <= high, got 0, 2, 1"):
         CommandDim("x", "x.pos", "m", 0, 1, 2, 1)
+
+
+def test_who_squats_stands_up_before_it_walks():
+    """The mode is sent once the command is one that a walking robot can do; and back again."""
+    space = SPACE.fit(
+        {Mode.STATIONARY: {"lift": (-0.2, 0.1)}, Mode.MOBILE: {"lift": (0.05, 0.3)}}, {}
+    )
+    smoother = CommandSmoother(space, 0.02)
+    executed, told, seen = np.array([-0.2, 0.0, 0.0]), Mode.STATIONARY, []
+    for mode, lift, v in ((Mode.MOBILE, -0.2, 0.5), (Mode.MOBILE, 0.3, 0.5)):
+        for _ in range(80):
+            sent, told = smoother.smooth(np.array([lift, v, 0.0]), mode, executed, told)
+            limited = space.limit(sent, executed, 0.02, told)
+            np.testing.assert_allclose(limited, sent, atol=SINGLE)
+            smoother.note(executed, limited)
+            executed = limited
+            seen.append((told, *executed[:2]))
+    low = [lift for told, lift, _ in seen if told is Mode.STATIONARY]
+    assert low
+    assert max(low) <= 0.05 + SINGLE
+    assert all(v == 0 for told, _, v in seen if told is Mode.STATIONARY)
+    assert min(lift for told, lift, _ in seen if told is Mode.MOBILE) >= 0.05 - 1e-5
+    assert executed[0] == pytest.approx(0.3, abs=1e-3)
+    for _ in range(120):
+        sent, told = smoother.smooth(np.array([0.3, 0, 0.0]), Mode.STATIONARY, executed, told)
+        limited = space.limit(sent, executed, 0.02, told)
+        smoother.note(executed, limited)
+        executed = limited
+        assert told is Mode.MOBILE or executed[0] <= 0.1 + SINGLE
+    assert told is Mode.STATIONARY

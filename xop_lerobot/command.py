@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 
@@ -73,10 +73,14 @@ class CommandSpace:
     r"""The admissible set :math:`\mathcal A = \{a \mid a_{min} \le a \le a_{max}\}` (Eq. 1d).
 
     Attributes:
-        dims: The entries, in order.
+        dims: The entries, in order; their bounds hold in all modes.
+        ranges: Narrower bounds in a mode, by entry: what a low-level policy can do.
+        dead_zones: Size of a velocity under which a low-level policy does nothing, by entry.
     """
 
     dims: tuple[CommandDim, ...]
+    ranges: Mapping[Mode, Mapping[str, tuple[float, float]]] = field(default_factory=dict)
+    dead_zones: Mapping[str, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.dims)
@@ -105,6 +109,65 @@ class CommandSpace:
     def high(self) -> np.ndarray:
         """Upper bounds. Shape (k,)."""
         return self._column("high")
+
+    @cached_property
+    def _bounds(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """Bounds in each mode. Shapes (k,)."""
+        bounds = []
+        for mode in Mode:
+            low, high = self.low.copy(), self.high.copy()
+            for name, (least, most) in self.ranges.get(mode, {}).items():
+                i = self.index(name)
+                low[i], high[i] = max(low[i], least), min(high[i], most)
+            low.setflags(write=False)
+            high.setflags(write=False)
+            bounds.append((low, high))
+        return tuple(bounds)
+
+    def bounds(self, mode: Mode) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest command in `mode`. Shapes (k,)."""
+        return self._bounds[mode]
+
+    def fit(
+        self,
+        ranges: Mapping[Mode, Mapping[str, tuple[float, float]]],
+        dead_zones: Mapping[str, float],
+    ) -> CommandSpace:
+        """The part of this space that a low-level policy can do.
+
+        Args:
+            ranges: Bounds in each mode, by entry; entries that are not named keep theirs.
+            dead_zones: Size of a velocity under which nothing happens, by entry.
+
+        Raises:
+            BadValue: If a range and the robot's bounds have nothing in common.
+            UnknownName: If there is no such entry.
+        """
+        for mode, limits in ranges.items():
+            for name, (least, most) in limits.items():
+                dim = self.dims[self.index(name)]
+                if least > most or most < dim.low or least > dim.high:
+                    raise BadValue(
+                        f"command {name!r} is {dim.low} to {dim.high} {dim.unit} for this robot, "
+                        f"and the policy's range in {mode.name.lower()} mode is {least} to {most}"
+                    )
+        fitted = replace(self, ranges=ranges, dead_zones=dead_zones)
+        low = np.min([fitted.bounds(mode)[0] for mode in Mode], axis=0)
+        high = np.max([fitted.bounds(mode)[1] for mode in Mode], axis=0)
+        dims = tuple(
+            replace(dim, low=least, high=most, neutral=min(max(dim.neutral, least), most))
+            for dim, least, most in zip(self.dims, low.tolist(), high.tolist(), strict=True)
+        )
+        return replace(fitted, dims=dims)
+
+    def extend(self, dims: tuple[CommandDim, ...]) -> CommandSpace:
+        """This space with further entries behind its own."""
+        return replace(self, dims=(*self.dims, *dims))
+
+    @cached_property
+    def _dead(self) -> np.ndarray:
+        """Dead zone of each entry. Shape (k,)."""
+        return np.array([self.dead_zones.get(dim.name, 0.0) for dim in self.dims])
 
     @cached_property
     def neutral(self) -> np.ndarray:
@@ -157,7 +220,19 @@ class CommandSpace:
         if mode is Mode.STATIONARY:
             still = np.clip(command, self.neutral - self.sway, self.neutral + self.sway)
             command = np.where(self.mobile_only, still, command)
-        return np.clip(command, self.low, self.high)
+        return np.clip(command, *self.bounds(mode))
+
+    def leave_dead_zones(self, command: np.ndarray, mode: Mode) -> np.ndarray:
+        """Move what a policy would not answer to where it does. Shapes (..., k).
+
+        In mobile mode a velocity within its dead zone goes to the nearer end: to zero, or to
+        where it acts. For planners: a robot executes what is on the way there too.
+        """
+        if mode is not Mode.MOBILE or not self.dead_zones:
+            return command
+        size = np.abs(command)
+        acts = np.where(size < 0.5 * self._dead, 0.0, np.sign(command) * self._dead)
+        return np.where(size < self._dead, acts, command)
 
     def compute_rest(self, command: np.ndarray, mode: Mode) -> np.ndarray:
         """What a robot that executes `command` in `mode` keeps of it to stand still. (k,).
@@ -170,7 +245,8 @@ class CommandSpace:
         stops = self.mobile_only & (np.abs(command - self.neutral) > self.sway + 1e-6)
         if mode is Mode.MOBILE:
             stops = self.mobile_only
-        return np.clip(np.where(stops, self.neutral, command), self.low, self.high)
+        low, high = self.bounds(mode)
+        return np.clip(np.where(stops, self.neutral, command), low, high)
 
     def index(self, name: str) -> int:
         """Return the position of `name`.

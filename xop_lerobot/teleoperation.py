@@ -81,13 +81,13 @@ class Teleoperation:
     """
 
     def __init__(self, config: TeleoperationConfig, info: RobotInfo) -> None:
-        self.config, self.info, self.morphology = config, info, info.morphology
+        policy = make_policy(info.low_level, info.low_level_path)
+        self.config, self.info, self.morphology = config, info, info.morphology.fit(policy)
         self.dt = 1 / info.fps
         device = make_device(config.device)
         device.introduce(info.name, explain_gestures(config.gestures))
         self._settings = OnlineSettings(self.morphology, config.retargeter)
         model = build_model(self.morphology, "planning", scene=info.scene)
-        policy = make_policy(info.low_level, info.low_level_path)
         obstacles: tuple[Obstacle, ...] | None = None
         if self.morphology.hull_points:  # the planning model holds the floor alone
             scene = build_model(self.morphology, "full", scene=info.scene)

@@ -53,6 +53,7 @@ class XopRobot(Robot):
         _check_cameras(self.morphology, config)
         policy_name = resolve_policy(self.morphology, config.low_level.name)
         self._policy = make_policy(policy_name, config.low_level.path)
+        self.morphology = self.morphology.fit(self._policy)
         self._body = Body(self.morphology)
         self._session = get_session(config.session)
         self._plant: Simulation | None = None

@@ -92,9 +92,15 @@ class JointTargets(Term, frozen=True, tag="joint_targets"):
 
 
 class Commands(Term, frozen=True, tag="commands", kw_only=True):
-    """Entries of the command, in its units."""
+    """Entries of the command, in its units.
+
+    Attributes:
+        names: Which.
+        gated: Whether they are shown as zero in stationary mode.
+    """
 
     names: tuple[str, ...]
+    gated: bool = False
 
 
 class Walks(Term, frozen=True, tag="walks"):
@@ -279,8 +285,8 @@ class PolicyTable(_Strict, frozen=True):
         terms: What a user has to know of the licence, said at first use; empty for nothing.
         motors: Motors that it was trained with.
         arm_limits: Angles within which arm targets are kept, by joint [rad].
-        ranges: What each mode was trained with: entry of the command -> lowest, highest. What
-            is outside is not asked of the network.
+        ranges: What it can do in each mode: entry of the command -> lowest, highest. What is
+            outside is not asked of it; entries that are not named keep the robot's bounds.
         stands_below: In mobile mode a robot stands as well while all these entries of the command
             are smaller in size.
         dead_zones: Size of a velocity under which nothing happens, by entry of the command.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from xop_lerobot.transforms import compute_projected_gravity, quat_conjugate, qu
 if TYPE_CHECKING:
     import mujoco
 
-_BASE_Q, _BASE_V = 7, 6
-"""Sizes of the free joint of the base in `qpos` and `qvel`."""
+type Ranges = Mapping[Literal["stationary", "mobile"], Mapping[str, tuple[float, float]]]
 
 
 @dataclass(frozen=True)
@@ -80,10 +79,8 @@ class Stage:
 
     network: NetworkStage
     motors: MotorSet
-    low: np.ndarray
-    """Lowest command that it is asked for in stationary and in mobile mode. Shape (2, k)."""
-    high: np.ndarray
-    """Highest command that it is asked for. Shape (2, k)."""
+    ranges: Ranges
+    """Commands that it can do, by mode and entry."""
 
 
 class NetworkPolicy(LowLevelPolicy):
@@ -117,6 +114,11 @@ class NetworkPolicy(LowLevelPolicy):
         self.name, self.table, self._joints = name, table, joints
         self.arm_limits: Mapping[str, tuple[float, float]] = _expand(table.arm_limits, joints)
         self.motors = MotorSet.read(table.motors, joints)
+        self.dead_zones: Mapping[str, float] = table.dead_zones
+        self.ranges = {
+            mode: dict(stage.ranges.get(_name(mode), {}))
+            for mode, stage in zip(Mode, (stationary, mobile), strict=True)
+        }
         self._stages = (stationary,) if mobile is stationary else (stationary, mobile)
         self._columns = FeatureColumns(joints)
         self._handover_s = table.handover_s
@@ -128,9 +130,6 @@ class NetworkPolicy(LowLevelPolicy):
         self._sees_velocity = any(stage.network.sees_velocity for stage in self._stages)
         self._waist, self._arms = _pair(joints.by_command), _pair(joints.by_arm)
         self._angles, self._speeds = as_index(joints.positions), as_index(joints.velocities)
-        self._low = np.stack([stage.low for stage in self._stages])
-        self._high = np.stack([stage.high for stage in self._stages])
-        self._has_ranges = bool(np.isfinite([self._low, self._high]).any())
         self.memory_size = sum(stage.network.memory_size for stage in self._stages)
         if len(self._stages) > 1:
             self.memory_size += 2 + 2 * len(joints.names)
@@ -223,10 +222,6 @@ class NetworkPolicy(LowLevelPolicy):
         stands = ~walks
         if self._has_slow:
             stands = stands | (np.abs(command) < self._slow).all(axis=1)
-        if self._has_ranges:
-            which = 0 if len(self._stages) == 1 else np.where(stands, 0, 1)
-            low, high = self._low[which, modes], self._high[which, modes]
-            command = np.minimum(np.maximum(command, low), high)
         shared = np.zeros((len(qpos), columns.num_shared))
         if self._sees_velocity:
             velocity = quat_rotate(quat_conjugate(qpos[:, 3:7]), qvel[:, :3])
@@ -239,6 +234,7 @@ class NetworkPolicy(LowLevelPolicy):
         targets[:, self._waist[0]] = command[:, self._waist[1]]
         targets[:, self._arms[0]] = arms[:, self._arms[1]]
         shared[:, columns["commands"]] = command
+        shared[:, columns["gated"]] = command * walks[:, None]
         shared[:, columns["walks"]] = walks[:, None]
         yaw_rate = np.zeros(len(qpos)) if self._turns is None else command[:, self._turns]
         return Situation(shared, stands, qpos[:, 3:7], yaw_rate)
@@ -297,6 +293,10 @@ class NetworkPolicy(LowLevelPolicy):
         later[:, 0], later[:, 1] = active, left
         later[:, 2 : 2 + nu], later[:, 2 + nu :] = difference, targets
         return targets, later
+
+
+def _name(mode: Mode) -> Literal["stationary", "mobile"]:
+    return "stationary" if mode is Mode.STATIONARY else "mobile"
 
 
 def _pair(mapping: Mapping[int, int]) -> tuple[slice | np.ndarray, slice | np.ndarray]:

@@ -129,7 +129,7 @@ def _make_term(name: str, joints: tuple[str, ...], scale: tuple[float, ...], fra
     if name == "joint_vel":
         return d.JointVelocities(scale=factor, frames=frames, joints=joints)
     if name == "command":
-        return d.Commands(scale=factor, frames=frames, names=VELOCITIES)
+        return d.Commands(scale=factor, frames=frames, names=VELOCITIES, gated=True)
     known = sorted([*plain, "joint_pos", "joint_vel", "command"])
     raise ValueError(f"'observation_names' has {name!r}. Known: {', '.join(known)}")
 

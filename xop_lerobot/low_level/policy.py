@@ -49,6 +49,11 @@ class LowLevelPolicy(ABC):
     """Angles within which arm targets are kept, by joint, where the robot does not stand or walk
     safely beyond [rad]; `scripts/benchmark_policies.py` tells."""
 
+    ranges: Mapping[Mode, Mapping[str, tuple[float, float]]] = {}
+    """Commands that it can do in each mode, by entry, where that is less than the robot's."""
+    dead_zones: Mapping[str, float] = {}
+    """Size of a velocity under which nothing happens, by entry of the command."""
+
     def adapt(self, model: mujoco.MjModel) -> None:
         """Give `model`, of a plant or of rollouts, the motors that the policy was trained with.
 

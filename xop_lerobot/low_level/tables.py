@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import get_args
 
 import msgspec
-import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue, PolicyFileError, UnknownName
 from xop_lerobot.low_level import description as d
 from xop_lerobot.low_level import onnx_metadata
-from xop_lerobot.low_level.joints import RobotJoints, read_joints
+from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.network_policy import MotorSet, NetworkPolicy, Stage
 from xop_lerobot.low_level.network_stage import NetworkStage
 from xop_lerobot.low_level.networks import LoadedNetwork, ReferenceNetwork, load_network
@@ -163,12 +162,11 @@ def _load_stage(
             load_network(finder.find(network.reference.file)),
             None if statistics is None else finder.find(statistics),
         )
-    low, high = _read_ranges(table, joints)
     try:
         stage = NetworkStage(network, joints, weights, reference)
     except BadValue as error:
         raise BadValue(f"network '{name}' with '{weights_file}': {error}") from error
-    return Stage(stage, MotorSet.read(table.motors, joints), low, high)
+    return Stage(stage, MotorSet.read(table.motors, joints), table.ranges)
 
 
 def _list_files(table: d.PolicyTable) -> list[d.File]:
@@ -179,17 +177,6 @@ def _list_files(table: d.PolicyTable) -> list[d.File]:
             files.append(network.reference.file)
             files += [] if network.reference.statistics is None else [network.reference.statistics]
     return files
-
-
-def _read_ranges(table: d.PolicyTable, joints: RobotJoints) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest command in each mode. Shapes (2, k)."""
-    low = np.full((2, len(joints.commands)), -np.inf)
-    high = -low
-    for mode in Mode:
-        for entry, (lowest, highest) in table.ranges.get(mode.name.lower(), {}).items():
-            column = joints.find_command(entry)
-            low[mode, column], high[mode, column] = lowest, highest
-    return low, high
 
 
 _said: set[str] = set()

@@ -43,6 +43,7 @@ class FeatureColumns:
             "velocities": num_joints,
             "targets": num_joints,  # commanded angles of waist and arms, else 0
             "commands": len(joints.commands),
+            "gated": len(joints.commands),  # zero in stationary mode
             "walks": 1,
             "actions": num_actions,
             "sin": num_phases,
@@ -159,6 +160,7 @@ class TermReader:
             case d.Actions():
                 chosen = self._outputs
             case d.Commands():
+                name = "gated" if term.gated else name
                 which = [joints.find_command(entry) for entry in term.names]
             case d.Sine() | d.Cosine():
                 which = term.phases

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -18,6 +19,8 @@ from xop_lerobot.retarget.config import MpcConfig, PaperParameters
 
 if TYPE_CHECKING:
     import mujoco
+
+    from xop_lerobot.low_level.policy import LowLevelPolicy
 
 ModelKind = Literal["full", "planning"]
 
@@ -151,6 +154,17 @@ class Morphology(ABC):
     def layout(self) -> ActionLayout:
         """How actions of this robot are laid out."""
         return ActionLayout(self.command_space, self.arm_names)
+
+    def fit(self, policy: LowLevelPolicy) -> Morphology:
+        """This robot with the commands that `policy` can do.
+
+        Raises:
+            BadValue: If they have nothing in common with the robot's.
+        """
+        fitted = copy.copy(self)
+        fitted.__dict__.pop("layout", None)
+        fitted.command_space = self.command_space.fit(policy.ranges, policy.dead_zones)
+        return fitted
 
     def rest_action(self) -> RobotAction:
         """Stand at rest: neutral command, stationary, arms at rest, grippers open."""

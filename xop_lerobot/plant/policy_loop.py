@@ -34,6 +34,7 @@ class PolicyLoop:
     """
 
     def __init__(self, morphology: Morphology, plant: Plant, policy: LowLevelPolicy) -> None:
+        morphology = morphology.fit(policy)
         self.morphology, self.plant, self.policy = morphology, plant, policy
         plant.adapt(policy)
         self._memory = policy.initial_memory(1)

@@ -36,8 +36,8 @@ class RealtimeLoop:
     """
 
     def __init__(self, morphology: Morphology, plant: Plant, policy: LowLevelPolicy) -> None:
-        self.morphology = morphology
         self._loop = PolicyLoop(morphology, plant, policy)
+        self.morphology = self._loop.morphology
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import CommandDim, CommandSpace
+from xop_lerobot.command import CommandDim
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arm_ik import ARM_MAX_RATE
@@ -43,7 +43,7 @@ class DecisionSpace:
                 CommandDim(name, f"{name}.pos", "rad", low, high, rest, max_rate=ARM_MAX_RATE)
             )
         self.num_commands = len(morphology.command_space)
-        self.space = CommandSpace((*morphology.command_space.dims, *dims))
+        self.space = morphology.command_space.extend(tuple(dims))
         arm_effects = (
             Effect(Acts.JOINT, name, lag_s=ARM_LAG_S, effort=ARM_EFFORT) for name in self.joints
         )

@@ -81,7 +81,8 @@ class DirectRetargeter(Retargeter):
                 free=self.command_model.acting(goal.mode) & ~velocities,
             )
         command = np.where(velocities, self._map_velocity(state, goal), command)
-        command = np.clip(command, self.space.low, self.space.high)
+        command = self.space.leave_dead_zones(command, goal.mode)
+        command = np.clip(command, *self.space.bounds(goal.mode))
         self._last = np.where(velocities, self.space.neutral, command)
         solve = perf_counter() - start
         return Plan(command, command[None], goal.mode, timings={"solve": solve})

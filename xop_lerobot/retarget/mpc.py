@@ -266,7 +266,7 @@ class MpcRetargeter(Retargeter):
         candidates = np.where(acting, candidates, held)
         noise = self._noise[mode] * acting * _compute_noise_share(poses, goals, config, served)
         samples = planner.sample(self._rng, noise, candidates)
-        commands = self.space.restrict(np.where(acting, samples.commands, held), mode)
+        commands = self._restrict(np.where(acting, samples.commands, held), mode)
         sampled = perf_counter()
 
         limited = self.command_model.limit_rates(executed, commands, mode, POLICY_DT)
@@ -296,7 +296,7 @@ class MpcRetargeter(Retargeter):
         touches = self._collision.find_touches(evaluation)
         verdict = judge(weights, costs, falls, touches, stop)
         planned = self._apply(verdict, planner, samples.commands, executed)
-        planned = self.space.restrict(np.where(acting, planned, held), mode)
+        planned = self._restrict(np.where(acting, planned, held), mode)
         best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
         end = perf_counter()
 
@@ -379,6 +379,10 @@ class MpcRetargeter(Retargeter):
             planner.reset(executed)
         else:
             planner.shift(max(0.0, time - self._last[0]) / POLICY_DT)
+
+    def _restrict(self, commands: np.ndarray, mode: Mode) -> np.ndarray:
+        """What of commands the mode, the bounds and the policy's dead zones leave. (..., k)."""
+        return self.space.restrict(self.space.leave_dead_zones(commands, mode), mode)
 
     def _predict(self, state: RobotState, decisions: np.ndarray, mode: Mode) -> Prediction:
         """Roll decisions out. Shape (K, H, n)."""

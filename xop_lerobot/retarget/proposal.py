@@ -221,7 +221,7 @@ class KinematicProposal:
         command = np.where(free, natural if start is None else start, natural)
         if not len(index) or not goals:
             return Solution(command, 0.0, 0.0)
-        low, high = bounds or (space.low, space.high)
+        low, high = bounds or space.bounds(mode)
         if executed is not None:  # beyond what can be reached in time nothing would change
             reach = space.compute_max_rate(mode, executed) * dt
             low, high = np.maximum(low, executed - reach), np.minimum(high, executed + reach)

@@ -46,13 +46,20 @@ class CommandSmoother:
             executed_mode: Mode being executed.
 
         Returns:
-            The command and the mode to send: still mobile while velocities are stopping. (k,).
+            The command, (k,), and the mode to send: still mobile while velocities are stopping,
+            still stationary while the command is not yet one that a walking robot can do.
         """
         space, stops = self.space, False
         command = check_vector("command", command, len(space))
         if mode is Mode.STATIONARY and executed_mode is Mode.MOBILE:
             stops, mode = True, Mode.MOBILE
             command = np.where(space.mobile_only, space.neutral, command)
+            command = np.clip(command, *space.bounds(Mode.STATIONARY))
+        if mode is Mode.MOBILE and executed_mode is Mode.STATIONARY:
+            low, high = space.bounds(mode)
+            outside = (executed < low - _AT_REST) | (executed > high + _AT_REST)
+            if outside.any():  # who squats stands up before it walks
+                mode, command = Mode.STATIONARY, np.clip(command, low, high)
         if self._sent is None or not np.array_equal(executed, self._sent):
             self._step = np.zeros(len(space))  # somebody else drove the robot
         wanted = space.limit(command, None, self.dt, mode)
@@ -62,8 +69,9 @@ class CommandSmoother:
         )
         step = np.clip(step, self._step - self._gain, self._step + self._gain)
         # What still moves towards a bound must be able to stop there.
-        rise = compute_braking_step(np.maximum(space.high - executed, 0), self._gain)
-        fall = compute_braking_step(np.maximum(executed - space.low, 0), self._gain)
+        low, high = space.bounds(mode)
+        rise = compute_braking_step(np.maximum(high - executed, 0), self._gain)
+        fall = compute_braking_step(np.maximum(executed - low, 0), self._gain)
         reach = space.max_rate * self.dt
         step = np.clip(step, -np.minimum(fall, reach), np.minimum(rise, reach))
         sent = executed + step
@@ -72,11 +80,14 @@ class CommandSmoother:
         return sent, mode
 
     def _is_at_rest(self, executed: np.ndarray, sent: np.ndarray) -> bool:
-        """Whether velocities are neutral, and a robot that is told to stand leaves them so."""
+        """Whether velocities are neutral, and a robot that is told to stand leaves all as it is."""
         space = self.space
         moving = space.mobile_only & (np.abs(sent - space.neutral) > _AT_REST)
+        low, high = space.bounds(Mode.STATIONARY)
+        outside = (sent < low - _AT_REST) | (sent > high + _AT_REST)
         kept = space.limit(sent, executed, self.dt, Mode.STATIONARY)
-        return not moving.any() and np.allclose(kept, sent, rtol=0, atol=_AT_REST)
+        close = np.allclose(kept, sent, rtol=0, atol=_AT_REST)
+        return close and not (moving | outside).any()
 
     def note(self, executed: np.ndarray, sent: np.ndarray) -> None:
         """Take down what was sent in the end. Shapes (k,)."""
