@@ -209,6 +209,15 @@ def test_who_rests_goes_on_from_what_was_executed(made_up: Path) -> None:
     np.testing.assert_allclose(frames, wanted)  # all but the outputs, which differ
 
 
+def test_parts_bring_their_limits(made_up: Path) -> None:
+    """Two policies as one have the arm limits of both, and in each mode the commands of one."""
+    policy = load_made_up("combined", made_up)
+    assert policy.arm_limits["left_shoulder_pitch_joint"] == (-3.0892, 1.5)
+    assert policy.ranges[STAND]["height"] == (0.39, 0.75)
+    assert policy.ranges[WALK]["height"] == (0.53, 0.78)
+    assert load_made_up("homie", made_up).dead_zones == {"vx": 0.25, "vy": 0.2, "yaw_rate": 0.7}
+
+
 def test_converted_targets_give_the_same_torque() -> None:
     """Other servos, the same torque at this angle and velocity."""
     rng = np.random.default_rng(0)

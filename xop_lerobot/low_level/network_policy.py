@@ -20,8 +20,6 @@ from xop_lerobot.transforms import compute_projected_gravity, quat_conjugate, qu
 if TYPE_CHECKING:
     import mujoco
 
-type Ranges = Mapping[Literal["stationary", "mobile"], Mapping[str, tuple[float, float]]]
-
 
 @dataclass(frozen=True)
 class MotorSet:
@@ -75,12 +73,17 @@ def convert_targets(
 
 @dataclass(frozen=True)
 class Stage:
-    """A network of a policy, and the motors that it was trained with."""
+    """A network of a policy, with what its own table says of it.
+
+    Attributes:
+        network: The network.
+        table: The table that it is from.
+        motors: The motors that it was trained with.
+    """
 
     network: NetworkStage
+    table: d.PolicyTable
     motors: MotorSet
-    ranges: Ranges
-    """Commands that it can do, by mode and entry."""
 
 
 class NetworkPolicy(LowLevelPolicy):
@@ -112,11 +115,11 @@ class NetworkPolicy(LowLevelPolicy):
         mobile: Stage,
     ) -> None:
         self.name, self.table, self._joints = name, table, joints
-        self.arm_limits: Mapping[str, tuple[float, float]] = _expand(table.arm_limits, joints)
+        self.arm_limits = _join_limits(joints, table, stationary.table, mobile.table)
         self.motors = MotorSet.read(table.motors, joints)
-        self.dead_zones: Mapping[str, float] = table.dead_zones
+        self.dead_zones: Mapping[str, float] = mobile.table.dead_zones
         self.ranges = {
-            mode: dict(stage.ranges.get(_name(mode), {}))
+            mode: dict(stage.table.ranges.get(_name(mode), {}))
             for mode, stage in zip(Mode, (stationary, mobile), strict=True)
         }
         self._stages = (stationary,) if mobile is stationary else (stationary, mobile)
@@ -231,7 +234,8 @@ class NetworkPolicy(LowLevelPolicy):
         shared[:, columns["positions"]] = qpos[:, self._angles]
         shared[:, columns["velocities"]] = qvel[:, self._speeds]
         targets = shared[:, columns["targets"]]
-        targets[:, self._waist[0]] = command[:, self._waist[1]]
+        waist = np.maximum(command[:, self._waist[1]], self._joints.low[self._waist[0]])
+        targets[:, self._waist[0]] = np.minimum(waist, self._joints.high[self._waist[0]])
         targets[:, self._arms[0]] = arms[:, self._arms[1]]
         shared[:, columns["commands"]] = command
         shared[:, columns["gated"]] = command * walks[:, None]
@@ -316,18 +320,21 @@ def check_batch(name: str, array: np.ndarray, n: int, size: int) -> np.ndarray:
     return array
 
 
-def _expand(
-    limits: Mapping[str, tuple[float, float]], joints: RobotJoints
-) -> dict[str, tuple[float, float]]:
-    """Limits of arm joints by their names.
+def _join_limits(
+    joints: RobotJoints, *tables: d.PolicyTable
+) -> Mapping[str, tuple[float, float]]:
+    """What the arm limits of all tables leave, by joint.
 
     Raises:
         BadValue: If a pattern names a joint that is no arm's.
     """
-    expanded = {}
-    for pattern, pair in limits.items():
-        for joint in joints.select([pattern]):
-            if joint not in joints.by_arm:
-                raise BadValue(f"arm_limits names {joints.names[joint]}, which is no joint of arms")
-            expanded[joints.names[joint]] = pair
-    return expanded
+    joined: dict[str, tuple[float, float]] = {}
+    for table in tables:
+        for pattern, (low, high) in table.arm_limits.items():
+            for joint in joints.select([pattern]):
+                name = joints.names[joint]
+                if joint not in joints.by_arm:
+                    raise BadValue(f"arm_limits names {name}, which is no joint of arms")
+                least, most = joined.get(name, (low, high))
+                joined[name] = max(least, low), min(most, high)
+    return joined

@@ -166,7 +166,7 @@ def _load_stage(
         stage = NetworkStage(network, joints, weights, reference)
     except BadValue as error:
         raise BadValue(f"network '{name}' with '{weights_file}': {error}") from error
-    return Stage(stage, MotorSet.read(table.motors, joints), table.ranges)
+    return Stage(stage, table, MotorSet.read(table.motors, joints))
 
 
 def _list_files(table: d.PolicyTable) -> list[d.File]:
