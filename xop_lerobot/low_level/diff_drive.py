@@ -86,7 +86,7 @@ class DiffDrive(LowLevelPolicy):
         command: np.ndarray,
         arms: np.ndarray,
         memory: np.ndarray,
-        mode: Mode,
+        mode: Mode | np.ndarray,
     ) -> PolicyOutput:
         """Compute actuator targets for the next 20 ms; see `LowLevelPolicy.act`.
 

@@ -320,9 +320,7 @@ def check_batch(name: str, array: np.ndarray, n: int, size: int) -> np.ndarray:
     return array
 
 
-def _join_limits(
-    joints: RobotJoints, *tables: d.PolicyTable
-) -> Mapping[str, tuple[float, float]]:
+def _join_limits(joints: RobotJoints, *tables: d.PolicyTable) -> Mapping[str, tuple[float, float]]:
     """What the arm limits of all tables leave, by joint.
 
     Raises:

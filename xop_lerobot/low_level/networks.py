@@ -140,7 +140,9 @@ class OnnxNetwork(LoadedNetwork):
         actions, *states = self._session.run(self._outputs, feed)
         if not states:
             return np.asarray(actions), hidden
-        return np.asarray(actions), np.concatenate([_from_state(state) for state in states], axis=1)
+        return np.asarray(actions), np.concatenate(
+            [_from_state(np.asarray(state)) for state in states], axis=1
+        )
 
 
 class TorchNetwork(LoadedNetwork):

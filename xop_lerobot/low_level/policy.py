@@ -74,7 +74,7 @@ class LowLevelPolicy(ABC):
         command: np.ndarray,
         arms: np.ndarray,
         memory: np.ndarray,
-        mode: Mode,
+        mode: Mode | np.ndarray,
     ) -> PolicyOutput:
         """Compute motor targets for the next 20 ms.
 
@@ -84,7 +84,8 @@ class LowLevelPolicy(ABC):
             command: Commands, in the robot's `CommandSpace`. Shape (n, k).
             arms: Arm joint targets [rad], then gripper openings [m]. Shape (n, m).
             memory: Memory of each member of the batch. Shape (n, memory_size).
-            mode: Stationary or mobile, one for the batch.
+            mode: Stationary or mobile, one for the batch or, for policies of networks, one each.
+                Shape () or (n,).
 
         Returns:
             Targets and the memory after the step; the inputs are left untouched.
