@@ -5,10 +5,8 @@ r"""Distil FALCON's G1 policy into the student that ships with the package.
 
 DAgger (Ross et al., 2011): many robots run in the planning model; each is driven by the teacher
 or by the student, the teacher's share falls from one to zero, and the student is trained on
-what the teacher would have done in every state that was met. The teacher drives legs and waist
-as FALCON does; its arms bear their weight, computed from the model, since FALCON does so only in
-the postures that it was trained with. Afterwards, and alone with ``--evaluate-only``, student and
-FALCON are compared on the same random sequences.
+what the teacher would have done in every state that was met. The teacher (`low_level_teacher.py`)
+is FALCON where the robot steps, and a balance that knows the true state where it stands.
 """
 
 from __future__ import annotations
@@ -16,21 +14,26 @@ from __future__ import annotations
 import argparse
 import logging
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import torch
+from low_level_teacher import ACTIONS, ARMS, JOINTS, Teacher
 from torch import nn
 
 from xop_lerobot.command import Mode
 from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.errors import BadValue
-from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
-from xop_lerobot.low_level.joints import read_joints
+from xop_lerobot.low_level.excitation import (
+    VELOCITIES,
+    Excitation,
+    ExcitationConfig,
+    make_excitation,
+)
 from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
-from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.low_level.tables import load_policy
 from xop_lerobot.low_level.trial import BatchSimulation
 from xop_lerobot.morphology.morphology import make_morphology
@@ -39,10 +42,10 @@ from xop_lerobot.morphology.scene import build_model
 logger = logging.getLogger("distill_low_level")
 
 WIDE = ExcitationConfig(
-    height=(0.48, 0.80),
+    height=(0.40, 0.79),
     waist_yaw=1.1,
     waist_roll=0.5,
-    waist_pitch=(-0.5, 0.5),
+    waist_pitch=(-0.5, 1.0),
     vx=1.0,
     vy=0.6,
     yaw_rate=1.0,
@@ -50,12 +53,26 @@ WIDE = ExcitationConfig(
     arm_speed=3.0,
     push=0.6,
     push_period=4.0,
-    hand_force=15.0,
+    hand_force=22.0,
 )
-"""Ranges of half of the training robots: wider than what a robot is asked for."""
+"""Ranges of most training robots: wider than what a robot is asked for."""
 
-USUAL = ExcitationConfig(waist_roll=0.2, waist_pitch=(-0.2, 0.3), push_period=4.0)
-"""Ranges of the other half of the robots: about those of the comparison."""
+LOW = replace(WIDE, height=(0.40, 0.62), push=0.3)
+"""Ranges of robots that stand low."""
+
+USUAL = ExcitationConfig(
+    height=(0.42, 0.78), waist_roll=0.2, waist_pitch=(-0.2, 0.6), push_period=4.0
+)
+"""About the ranges of the comparison."""
+
+STANDING, MOVING = (LOW, WIDE), (WIDE, USUAL)
+"""Ranges of the quarters of the robots that stand all the time, and that sometimes walk."""
+
+SWAY = (0.15, 0.1)
+"""Largest velocities, forward and left, by which a standing robot is told to sway [m/s]."""
+
+FORCE_LAG_S = 0.2
+"""Time in which forces on the hands grow [s]."""
 
 EPISODE_STEPS = 1000
 BLOCK_STEPS = 50
@@ -64,67 +81,23 @@ BLOCK_STEPS = 50
 REFINE_AFTER = 3
 """Rounds of experience before an earlier student is trained further."""
 
-JOINTS = read_joints("g1")
-ARMS = slice(JOINTS.arms[0], JOINTS.arms[-1] + 1)
-ACTIONS = slice(0, len(JOINTS.names))
-"""Last actions in the memory of student and FALCON."""
-ACTION_SCALE = 0.25
-"""Of both tables."""
+NUM_JOINTS = len(JOINTS.names)
 
-OUTPUT_WEIGHTS = np.ones(len(JOINTS.names))
+OUTPUT_WEIGHTS = np.ones(NUM_JOINTS)
 OUTPUT_WEIGHTS[13:15] = 0.1  # waist roll and pitch: only seen as a last action
 OUTPUT_WEIGHTS[ARMS] = 0.3  # arms: a small residual
 
 
-class Teacher:
-    r"""FALCON, whose arms' part of the action bears the arms' weight.
-
-    The servos of the arms are soft. Their targets are offset by the torque of gravity over their
-    stiffness, :math:`\Delta q^* = \tau_g(q) / k_p`, from the planning model.
-
-    Args:
-        path: FALCON's ONNX file; None for the cached or downloaded one.
-    """
-
-    def __init__(self, path: str | None) -> None:
-        self.policy = load_policy("falcon", path)
-        self._model = build_model(make_morphology("g1"), "planning")
-        self._data = mujoco.MjData(self._model)
-        self._stiffness = self._model.actuator_gainprm[ARMS, 0]
-
-    def act(
-        self,
-        qpos: np.ndarray,
-        qvel: np.ndarray,
-        command: np.ndarray,
-        arms: np.ndarray,
-        memory: np.ndarray,
-        mode: Mode | np.ndarray,
-    ) -> PolicyOutput:
-        """Compute motor targets for the next 20 ms; see `LowLevelPolicy.act`."""
-        targets, after = self.policy.act(qpos, qvel, command, arms, memory, mode)
-        offsets = self._compute_offsets(qpos)
-        after[:, ACTIONS][:, ARMS] = offsets / ACTION_SCALE
-        low, high = JOINTS.low[ARMS], JOINTS.high[ARMS]
-        targets[:, ARMS] = np.clip(arms + offsets, low, high)
-        return PolicyOutput(targets, after)
-
-    def _compute_offsets(self, qpos: np.ndarray) -> np.ndarray:
-        """Offsets of the arms' targets [rad]. Shapes (n, 36) -> (n, 14)."""
-        model, data, force = self._model, self._data, np.zeros(self._model.nv)
-        offsets = np.empty((len(qpos), len(self._stiffness)))
-        for row, configuration in zip(offsets, qpos, strict=True):
-            data.qpos[:] = configuration
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            mujoco.mj_comVel(model, data)
-            mujoco.mj_rne(model, data, 0, force)  # at rest: gravity alone
-            row[:] = force[6:][ARMS] / self._stiffness
-        return offsets
+LIFT = 16.0
+"""Offset at which ELU is the identity for what the skip gives, which is within 3."""
 
 
 class Network(LoadedNetwork):
-    """The student while it is trained: standardised inputs, ELU between the layers."""
+    """The student while it is trained: standardised inputs, ELU between the layers, and a skip.
+
+    Much of what the teacher does is linear: targets are the angles of now plus torques over
+    stiffness. A linear path beside the layers learns that at once.
+    """
 
     def __init__(self, hidden: tuple[int, ...], observations: torch.Tensor) -> None:
         self.mean = observations.mean(0)
@@ -136,6 +109,18 @@ class Network(LoadedNetwork):
         for inputs, outputs in zip(sizes, sizes[1:], strict=False):
             layers += [nn.Linear(inputs, outputs), nn.ELU()]
         self.body = nn.Sequential(*layers[:-1])
+        self.skip = nn.Linear(sizes[0], sizes[-1])
+        nn.init.zeros_(self.skip.weight)
+        nn.init.zeros_(self.skip.bias)
+
+    def parameters(self) -> list[nn.Parameter]:
+        """All that is trained."""
+        return [*self.body.parameters(), *self.skip.parameters()]
+
+    def compute(self, observation: torch.Tensor) -> torch.Tensor:
+        """Actions for observations. Shapes (n, 575) -> (n, 29)."""
+        inputs = self.standardise(observation)
+        return self.body(inputs) + self.skip(inputs)
 
     def standardise(self, observation: torch.Tensor) -> torch.Tensor:
         """Shift and scale observations to about zero mean and unit spread."""
@@ -147,29 +132,50 @@ class Network(LoadedNetwork):
         """Run the network; see `LoadedNetwork`."""
         del past
         with torch.no_grad():
-            seen = self.standardise(torch.from_numpy(observation))
-            return self.body(seen).numpy(), hidden
+            return self.compute(torch.from_numpy(observation)).numpy(), hidden
 
     def load(self, weights: list[np.ndarray], biases: list[np.ndarray]) -> None:
         """Take the layers of a saved student; the inverse of `layers`."""
         mean, spread = self.mean.double().numpy(), self.spread.double().numpy()
-        weights, biases = [weights[0].astype(float), *weights[1:]], list(biases)
-        biases[0] = biases[0] + mean @ weights[0]
-        weights[0] = weights[0] * spread[:, None]
         linear = [module for module in self.body if isinstance(module, nn.Linear)]
+        first, offset = weights[0].astype(float) * spread[:, None], biases[0] + mean @ weights[0]
+        weights, biases = [first, *weights[1:]], [offset, *biases[1:]]
         with torch.no_grad():
+            if weights[0].shape[1] > linear[0].out_features:
+                self.skip.weight.copy_(torch.from_numpy(first[:, -NUM_JOINTS:].T))
+                self.skip.bias.copy_(torch.from_numpy(offset[-NUM_JOINTS:] - LIFT))
+                biases[-1] = biases[-1] + LIFT
             for layer, weight, bias in zip(linear, weights, biases, strict=True):
-                layer.weight.copy_(torch.from_numpy(weight.T))
-                layer.bias.copy_(torch.from_numpy(bias))
+                inputs, outputs = layer.in_features, layer.out_features
+                layer.weight.copy_(torch.from_numpy(weight[:inputs, :outputs].T))
+                layer.bias.copy_(torch.from_numpy(bias[:outputs]))
 
     def layers(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return matrices (inputs, outputs) and offsets, the standardisation folded in."""
+        """Return matrices (inputs, outputs) and offsets, standardisation and skip folded in.
+
+        The skip becomes 29 units more in each hidden layer, lifted so far that ELU leaves them as
+        they are; so the network that runs is a plain multilayer perceptron.
+        """
         linear = [module for module in self.body if isinstance(module, nn.Linear)]
-        weights = [layer.weight.detach().double().T.clone() for layer in linear]
-        biases = [layer.bias.detach().double().clone() for layer in linear]
-        weights[0] /= self.spread.double()[:, None]
-        biases[0] -= self.mean.double() @ weights[0]
-        return [w.numpy() for w in weights], [b.numpy() for b in biases]
+        weights = [layer.weight.detach().double().T.numpy() for layer in linear]
+        biases = [layer.bias.detach().double().numpy() for layer in linear]
+        skip = self.skip.weight.detach().double().T.numpy()
+        weights[0] = np.concatenate([weights[0], skip], axis=1)
+        biases[0] = np.concatenate([biases[0], self.skip.bias.detach().double().numpy() + LIFT])
+        for layer in range(1, len(weights)):
+            last = layer == len(weights) - 1
+            inputs, outputs = weights[layer].shape
+            carried = np.zeros((inputs + NUM_JOINTS, outputs + NUM_JOINTS))
+            carried[:inputs, :outputs] = weights[layer]
+            carried[inputs:, -NUM_JOINTS:] = np.eye(NUM_JOINTS)
+            if last:
+                carried[:, :outputs] += carried[:, -NUM_JOINTS:]
+            weights[layer] = carried[:, :outputs] if last else carried
+            more = np.zeros(0 if last else NUM_JOINTS)
+            biases[layer] = np.concatenate([biases[layer] - LIFT * last, more])
+        weights[0] = weights[0] / self.spread.double().numpy()[:, None]
+        biases[0] = biases[0] - self.mean.double().numpy() @ weights[0]
+        return weights, biases
 
 
 class Experience:
@@ -205,6 +211,9 @@ class Collector:
         self.simulation = BatchSimulation(models, morphology.standing_qpos(), threads)
         self.student = load_policy("default")  # its table says what is remembered and seen
         self.memory = self.student.initial_memory(robots)
+        self.taught_memory, self.share = teacher.initial_memory(robots), np.zeros(robots)
+        # Arms that push against something, or each other, are not where they are told to be.
+        self.hindered = rng.uniform(size=(robots, 1)) < 0.15  # noqa: PLR2004
         self.noise = rng.uniform(0, 1, (robots, 1)) * (rng.uniform(size=(robots, 1)) < 0.6)  # noqa: PLR2004
         self.excitation: Excitation | None = None
         self.step = 0
@@ -224,24 +233,29 @@ class Collector:
                 teaches = self.rng.uniform(size=self.robots) < share
             random = self.excitation
             simulation.push(random.push[self.step])
-            inputs = (
-                *self._sense(),
-                random.command[self.step],
-                random.arms[self.step],
-                self.memory,
-                random.mode[self.step],
-            )
-            taught = self.teacher.act(*inputs)
-            experience.add(self.student.observe(*inputs), taught.memory[:, ACTIONS])
-            targets, self.memory = taught
-            if student is not None and not teaches.all():
-                own = student.act(*inputs)
-                targets = np.where(teaches[:, None], taught.targets, own.targets)
-                self.memory = np.where(teaches[:, None], taught.memory, own.memory)
-            simulation.step(targets, random.hand_force[self.step])
+            sensed, force = self._sense(), random.hand_force[self.step]
+            command, arms = random.command[self.step], random.arms[self.step]
+            mode = random.mode[self.step]
+            taught = self.teacher.teach(
+                (simulation.qpos, simulation.qvel), sensed, command, arms, self.taught_memory,
+                mode, force, self.share,
+            )  # fmt: skip
+            inputs = (*sensed, command, arms, self.memory, mode)
+            experience.add(self.student.observe(*inputs), taught.actions)
+            own, self.memory = (student or self.student).act(*inputs)
+            targets = np.where(teaches[:, None], taught.targets, own)
+            self.taught_memory, self.share = taught.memory, taught.share
+            # Both remember what was done, whoever did it.
+            self.memory[teaches, ACTIONS] = taught.actions[teaches]
+            self.taught_memory[:, ACTIONS] = self.memory[:, ACTIONS]
+            elsewhere = np.roll(arms, 1, axis=0) - arms
+            targets[:, ARMS] += np.where(self.hindered, elsewhere, 0.0)
+            simulation.step(targets, force)
             down = simulation.fallen()
             simulation.reset(down)
             self.memory[down] = self.student.initial_memory(int(down.sum()))
+            self.taught_memory[down] = self.teacher.initial_memory(int(down.sum()))
+            self.share[down] = 0.0
             self.falls += int(down.sum())
             self.step += 1
 
@@ -258,20 +272,39 @@ class Collector:
 
 
 def make_training_excitation(rng: np.random.Generator, robots: int) -> Excitation:
-    """Draw one episode: half of the robots in the wide ranges, the others in the usual ones."""
-    sizes = (robots // 2, robots - robots // 2)
+    """Draw one episode: a quarter of the robots in each of the ranges, half of them standing."""
+    configs = (*STANDING, *MOVING)
+    sizes = np.diff(np.arange(len(configs) + 1) * robots // len(configs))
+    standing = sizes[: len(STANDING)].sum()
     parts = [
         make_excitation(rng, size, EPISODE_STEPS, config)
-        for size, config in zip(sizes, (WIDE, USUAL), strict=True)
+        for size, config in zip(sizes, configs, strict=True)
     ]
     names = [field.name for field in fields(Excitation)]
-    return Excitation(
+    drawn = Excitation(
         **{name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in names}
     )
+    drawn.mode[:, :standing] = Mode.STATIONARY
+    force = drawn.hand_force
+    force[:, ::2, 1] = force[:, ::2, 0]  # half carry with both hands
+    for step in range(1, EPISODE_STEPS):  # forces that jump can't be leant against
+        force[step] = force[step - 1] + (force[step] - force[step - 1]) * (POLICY_DT / FORCE_LAG_S)
+    stands = drawn.mode == Mode.STATIONARY
+    drawn.command[:, :standing, VELOCITIES] = 0.0
+    # A standing robot is told small velocities that change slowly, by which it sways.
+    phase = rng.uniform(0, 2 * np.pi, (2, robots)) + np.arange(EPISODE_STEPS)[:, None, None] * (
+        POLICY_DT * rng.uniform(0.2, 1.5, (2, robots))
+    )
+    size = rng.uniform(0, 1, (2, robots)) * (rng.uniform(size=robots) < 0.4)  # noqa: PLR2004
+    for axis, largest in enumerate(SWAY):
+        sway = largest * size[axis] * np.sin(phase[:, axis])
+        drawn.command[..., VELOCITIES.start + axis] += np.where(stands, sway, 0.0)
+    return drawn
 
 
 def randomise(model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjModel:
-    """Vary friction, masses and gains of a model in place."""
+    """Vary friction, masses and gains of a model in place; a quarter have dry friction."""
+    model.dof_frictionloss[6:] = 0.2 if rng.uniform() < 0.25 else 0.0  # noqa: PLR2004
     model.geom_friction[:, 0] = rng.uniform(0.5, 1.2)
     scale = rng.uniform(0.95, 1.05, (model.nbody, 1))
     model.body_mass *= scale[:, 0]
@@ -293,14 +326,14 @@ def train(  # noqa: PLR0913
     """Fit the network; the learning rate falls from `rates[0]` to `rates[1]`. Returns the loss."""
     spread = experience.actions[: experience.size : 50].float().std(0).clamp(min=0.05)
     scale = torch.from_numpy(OUTPUT_WEIGHTS).float().sqrt() / spread
-    optimizer = torch.optim.Adam(network.body.parameters(), lr=rates[0])
+    optimizer = torch.optim.Adam(network.parameters(), lr=rates[0])
     decay = (rates[1] / rates[0]) ** (1 / max(updates, 1))
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, decay)
     total = 0.0
     for _ in range(updates):
         observations, actions = experience.draw(batch, generator)
-        error = (network.body(network.standardise(observations)) - actions) * scale
-        loss = nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.5)
+        error = (network.compute(observations) - actions) * scale
+        loss = nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.1)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -365,7 +398,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--teacher", help="FALCON's ONNX file; None: cached or downloaded")
     parser.add_argument("--seed", type=int, default=0, help="seed of training")
     parser.add_argument("--out", type=Path, required=True, help="weights of the student, .npz")
-    parser.add_argument("--hidden", type=int, nargs="+", default=[384, 192], help="layer widths")
+    parser.add_argument("--hidden", type=int, nargs="+", default=[512, 256], help="layer widths")
     parser.add_argument("--init", type=Path, help="weights of a student to train further, .npz")
     parser.add_argument("--rounds", type=int, default=24, help="rounds of DAgger")
     parser.add_argument("--robots", type=int, default=256, help="robots at once")

@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 FPS = 25
 RATE_HZ = 50
 HANDS = {
-    "left": ((0.152, 0.233, -0.561), (0.738, -0.656, 0.102, 0.122)),
-    "right": ((0.152, -0.233, -0.561), (0.738, 0.656, 0.102, -0.122)),
+    "left": ((0.173, 0.234, -0.555), (0.737, -0.667, 0.074, 0.080)),
+    "right": ((0.173, -0.234, -0.555), (0.737, 0.667, 0.074, -0.080)),
 }
 """Wrists from the head [m], and wxyz: as a G1 holds them at rest, so that its arms need not move
 when the person engages."""

@@ -71,7 +71,7 @@ def test_figures_tell_the_kinds(session, kinds, capsys):
         assert (row["gap_time"] == pytest.approx(0.8, abs=0.1)) is (kind == "tracking_loss"), kind
         assert row["trouble"] is (kind == "fall"), kind
         assert row["tracking_p95"] < 1.5
-        assert (row["command_roughness"] < 1.5) is (kind == "failure"), kind
+        assert (row["command_roughness"] < 1.0) is (kind == "failure"), kind
         assert row["robot"] == "xop_g1"
         assert row["missing_frames"] == row["dropped_frames"] == 0
         assert row["readable"]

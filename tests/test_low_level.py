@@ -26,7 +26,12 @@ from xop_lerobot.low_level.tables import find_table, load_policy, read_table
 from xop_lerobot.low_level.trial import run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.transforms import compute_projected_gravity, quat_conjugate, quat_rotate
+from xop_lerobot.transforms import (
+    compute_projected_gravity,
+    quat_conjugate,
+    quat_rotate,
+    quat_to_rpy,
+)
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[1] / ".." / "shared"))
 FALCON_FILE = read_table(find_table("falcon")).networks["whole_body"].file
@@ -69,6 +74,9 @@ def make_inputs(policy: LowLevelPolicy, n: int, seed: int = 0) -> Inputs:
     qvel = rng.normal(0, 0.3, (n, build_model(morphology, "planning").nv))
     memory = rng.normal(0, 0.3, (n, policy.memory_size))
     return qpos, qvel, command, arms, memory
+
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 
 def test_unknown_policy_is_named_with_the_known_ones() -> None:
@@ -166,7 +174,7 @@ def test_observation_of_the_student() -> None:
     np.testing.assert_allclose(frame[:, 29:32], qvel[:, 3:6] / 4, rtol=1e-6)
     np.testing.assert_allclose(frame[:, 32:36], command[:, [6, 0, 4, 5]] * [1, 2, 1, 1], rtol=1e-6)
     assert (frame[:, 36] == 1).all()
-    np.testing.assert_allclose(frame[:, 37], command[:, 1], rtol=1e-6)
+    np.testing.assert_allclose(frame[:, 37:40], command[:, 1:4], rtol=1e-6)
     angles = frame[:, 40:69].copy()
     angles[:, :12] += DEFAULT_LEGS
     angles[:, 13:15] += command[:, 2:4]  # waist roll and pitch are relative to the command
@@ -199,6 +207,17 @@ def test_memory_holds_the_last_output_and_four_frames_oldest_first() -> None:
     np.testing.assert_allclose(memory[0, 29:], np.concatenate(frames[-4:]), atol=1e-6)
 
 
+def test_waist_beyond_its_joints_is_not_seen_as_an_error() -> None:
+    """The joints' angles are shown less what the joints can take of the command."""
+    policy, joints = load_policy("default"), read_joints("g1")
+    qpos, qvel, command, arms, memory = make_inputs(policy, 1)
+    command[:, 2:4] = -0.3, 1.0
+    frame = policy.observe(qpos, qvel, command, arms, memory, Mode.STATIONARY)[:, -115:]
+    shown = qpos[:, 20:22] - [-0.3, joints.high[14]]
+    np.testing.assert_allclose(frame[:, 53:55], shown, atol=1e-6)
+    np.testing.assert_allclose(frame[:, 38:40], [[-0.3, 1.0]], atol=1e-6)
+
+
 def test_targets_stay_within_the_limits_and_waist_tilt_is_direct() -> None:
     """A wild output is clipped; waist roll and pitch get the commanded angle."""
     policy, joints = load_policy("default", network=Says(80.0)), read_joints("g1")
@@ -229,22 +248,140 @@ def test_g1_stands_and_walks(name: str) -> None:
 
 
 def test_g1_squats_and_leans() -> None:
-    """The base follows the height, the waist its three angles."""
-    policy, simulation = make_policy("default"), make_simulation(2, threads=1)
-    final = np.array([[0.6, 0, 0, 0, 0, 0, 0], [0.75, 0.6, 0.15, 0.3, 0, 0, 0]])
-    arms = np.tile(make_morphology("g1").rest_action().arms, (2, 1))
-    memory = policy.initial_memory(2)
-    for step in range(250):
-        command = STAND + min(step / 50, 1) * (final - STAND)
+    """The pelvis follows height and pitch, the waist its three angles, and the feet stay."""
+    policy, simulation = make_policy("default"), make_simulation(4, threads=1)
+    final = np.array(
+        [
+            [0.6, 0, 0, 0, 0, 0, 0],
+            [0.45, 0, 0, 0, 0, 0, 0],
+            [0.75, 0.6, 0.15, 0.3, 0, 0, 0],
+            [0.7, 0, 0, 1.0, 0, 0, 0],
+        ]
+    )
+    arms = np.tile(make_morphology("g1").rest_action().arms, (4, 1))
+    memory = policy.initial_memory(4)
+    for step in range(350):
+        command = STAND + min(step / 75, 1) * (final - STAND)
         targets, memory = policy.act(
             simulation.qpos, simulation.qvel, command, arms, memory, Mode.STATIONARY
         )
         simulation.step(targets)
     assert not simulation.fallen().any()
-    assert abs(simulation.qpos[0, 2] - 0.6) < 0.03
-    np.testing.assert_allclose(simulation.qpos[1, 19:22], [0.6, 0.15, 0.3], atol=0.12)
-    assert np.linalg.norm(simulation.qpos[:, :2], axis=1).max() < 0.3
+    np.testing.assert_allclose(simulation.qpos[:, 2], final[:, 0], atol=0.03)
+    np.testing.assert_allclose(simulation.qpos[2, 19:22], [0.6, 0.15, 0.3], atol=0.12)
+    pitch = quat_to_rpy(simulation.qpos[:, 3:7])[:, 1]
+    np.testing.assert_allclose(pitch[[0, 2, 3]], [0, 0, 0.5], atol=0.12)
+    assert np.linalg.norm(simulation.qpos[:, :2], axis=1).max() < 0.2  # noqa: PLR2004
+    assert np.abs(simulation.qvel[:, :2]).max() < 0.02  # noqa: PLR2004
     simulation.close()
+
+
+def test_g1_stands_with_arms_anywhere() -> None:
+    """Random arm postures, high and low: nobody falls or walks off."""
+    n = 12
+    joints = read_joints("g1")
+    low, high = joints.low[joints.arms], joints.high[joints.arms]
+    spread = np.random.default_rng(0).uniform(-0.8, 0.8, (n, 14))
+    postures = (low + high) / 2 + spread * (high - low) / 2
+    rest = make_morphology("g1").rest_action().arms
+    policy, simulation = make_policy("default"), make_simulation(n, threads=1)
+    memory = policy.initial_memory(n)
+    command = np.tile(STAND, (n, 1))
+    for step in range(300):
+        command[:, 0] = np.maximum(np.where(np.arange(n) % 2, 0.6, 0.75), 0.75 - 0.005 * step)
+        arms = rest + min(step / 75, 1) * (postures - rest)
+        targets, memory = policy.act(
+            simulation.qpos, simulation.qvel, command, arms, memory, Mode.STATIONARY
+        )
+        simulation.step(targets)
+    assert not simulation.fallen().any()
+    assert np.linalg.norm(simulation.qpos[:, :2], axis=1).max() < 0.15  # noqa: PLR2004
+    simulation.close()
+
+
+def test_balance_stands_without_falcon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The teacher's own balance: at its height, leaning, under forces, and dead still."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from low_level_teacher import Balance  # noqa: PLC0415
+
+    n, balance = 4, Balance()
+    rest = make_morphology("g1").rest_action().arms
+    height, lean = np.array([0.78, 0.5, 0.42, 0.7]), np.array([0.0, 0.0, 0.5, 0.3])
+    force = np.zeros((n, 2, 3))
+    force[3, :, 1] = 10.0
+    simulation, soles = make_simulation(n, threads=1), np.empty(0)
+    for step in range(250):
+        now = np.maximum(height, 0.78 - 0.005 * step)
+        share = min(step / 75, 1)
+        state = simulation.qpos, simulation.qvel
+        measured = balance.body.measure(*state)
+        legs = balance.compute(*state, measured, now, share * lean, np.zeros((n, 2)), share * force)
+        targets = np.tile(np.concatenate([np.zeros(15), rest]), (n, 1))
+        targets[:, :12] = legs.targets
+        simulation.step(targets, share * force)
+        if step == 0:
+            soles = measured.soles
+    assert not simulation.fallen().any()
+    np.testing.assert_allclose(simulation.qpos[:, 2], height, atol=0.01)
+    pitch = quat_to_rpy(simulation.qpos[:, 3:7])[:, 1]
+    np.testing.assert_allclose(pitch[[0, 2, 3]], lean[[0, 2, 3]], atol=0.05)
+    assert np.abs(measured.soles - soles).max() < 0.02  # noqa: PLR2004
+    assert np.abs(simulation.qvel[:3]).max() < 0.01  # noqa: PLR2004  # unless pulled, dead still
+    simulation.close()
+
+
+def test_teacher_steps_when_pushed_and_stands_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A push out of the support is FALCON's; once the feet are still the balance acts again."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    from low_level_teacher import ACTIONS, Teacher  # noqa: PLC0415
+
+    teacher, simulation = Teacher(find_teacher()), make_simulation(2, threads=1)
+    rest = np.tile(make_morphology("g1").rest_action().arms, (2, 1))
+    memory, share, shares = teacher.initial_memory(2), np.zeros(2), []
+    command, mode = np.tile(STAND, (2, 1)), np.full(2, Mode.STATIONARY)
+    for step in range(250):
+        if step == 50:
+            simulation.push(np.array([[0.8, 0.0], [0.0, 0.0]]))
+        state = simulation.qpos, simulation.qvel
+        taught = teacher.teach(
+            state, state, command, rest, memory, mode, np.zeros((2, 2, 3)), share
+        )
+        memory, share = taught.memory, taught.share
+        memory[:, ACTIONS] = taught.actions
+        simulation.step(taught.targets)
+        shares.append(share)
+    assert not simulation.fallen().any()
+    assert np.min(shares[50:], axis=0)[0] == 0
+    assert np.min(shares[50:], axis=0)[1] == 1
+    np.testing.assert_array_equal(share, 1)
+    assert simulation.qpos[0, 0] > 0.15  # noqa: PLR2004
+    assert np.abs(simulation.qvel[:, :3]).max() < 0.01  # noqa: PLR2004
+    simulation.close()
+
+
+def test_skip_is_folded_into_the_layers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A saved student does what the one in training did, and can be trained further."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    import torch  # noqa: PLC0415
+    from distill_low_level import Network  # noqa: PLC0415
+
+    torch.manual_seed(0)
+    observations = torch.randn(50, 575) * torch.rand(575)
+    network = Network((16, 8), observations)
+    torch.nn.init.normal_(network.skip.weight, 0, 0.05)
+    hidden = np.zeros((50, 0), np.float32)
+    expected, _ = network(observations.numpy(), hidden)
+    save_weights(tmp_path / "student.npz", *network.layers())
+    layers = load_weights(tmp_path / "student.npz")
+    plain = observations.numpy()
+    for weight, bias in zip(*layers, strict=True):
+        plain = plain @ weight + bias
+        if weight is not layers[0][-1]:
+            plain = np.where(plain > 0, plain, np.expm1(np.minimum(plain, 0)))
+    np.testing.assert_allclose(plain, expected, atol=1e-4)
+    again = Network((16, 8), 2 * observations + 1)
+    again.load(*layers)
+    np.testing.assert_allclose(again(observations.numpy(), hidden)[0], expected, atol=1e-4)
 
 
 def test_trials_count_falls_and_errors() -> None:
@@ -303,7 +440,7 @@ def test_student_file_errors(tmp_path: Path) -> None:
     assert str(error.value) == (
         f"policy table '{find_table('default')}': network 'whole_body' with '{narrow}': the "
         "network has 100 inputs, and its terms are 575 numbers: term past 460, term actions 29, "
-        "term angular_velocity 3, term commands 4, term walks 1, term commands 1, term constant 2, "
+        "term angular_velocity 3, term commands 4, term walks 1, term commands 1, term commands 2, "
         "term joint_positions 29, term joint_velocities 29, term gravity 3, term joint_targets 14"
     )
     broken = tmp_path / "broken.npz"
@@ -435,9 +572,6 @@ def test_wrong_shape_or_format(tmp_path: Path) -> None:
         make_policy("falcon", str(text.rename(tmp_path / "text.txt")))
 
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
-
-
 def test_distillation_runs_from_a_teacher_file(tmp_path: Path) -> None:
     """The script makes loadable weights."""
     out = tmp_path / "student.npz"
@@ -446,7 +580,7 @@ def test_distillation_runs_from_a_teacher_file(tmp_path: Path) -> None:
     command = [sys.executable, script, "--teacher", find_teacher(), *small.split()]
     subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, timeout=300)
     weights, _ = load_weights(out)
-    assert [w.shape for w in weights] == [(575, 384), (384, 192), (192, 29)]
+    assert [w.shape for w in weights] == [(575, 541), (541, 285), (285, 29)]
 
 
 def test_benchmark_of_policies_writes_a_table(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ class G1(Morphology):
     name = "g1"
     command_space = CommandSpace(
         (
-            CommandDim("height", "height.pos", "m", 0.53, 0.78, 0.75, 0.25, max_accel=5.0),
+            CommandDim("height", "height.pos", "m", 0.36, 0.78, 0.75, 0.25, max_accel=5.0),
             CommandDim("waist_yaw", "waist_yaw.pos", "rad", -1.0, 1.0, 0.0, 2.0, max_accel=20.0),
             CommandDim("waist_roll", "waist_roll.pos", "rad", -0.5, 0.5, 0.0, 2.0, max_accel=20.0),
             CommandDim(
