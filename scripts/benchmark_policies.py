@@ -188,8 +188,8 @@ def write_table(results: Results, arguments: argparse.Namespace) -> str:
     """Write the figures as Markdown tables, a column a policy."""
     lines = [
         f"Planning model, MuJoCo {mujoco.__version__}; {arguments.trials} random sequences of "
-        f"{arguments.seconds:g} s and {arguments.trials} postures a row, seed {arguments.seed}; "
-        f"under the controller mild noise, {arguments.seeds} seeds, median / worst.",
+        f"{arguments.seconds:g} s and {arguments.trials} postures a row, seed {arguments.seed}. "
+        "Commands are the same for all, also beyond what a policy's table says it can do.",
     ]
     writers: dict[str, tuple[str, Callable[[Any], dict[str, str]]]] = {
         "commands": ("Plain commands, held for 10 s", _write_commands),
@@ -197,8 +197,9 @@ def write_table(results: Results, arguments: argparse.Namespace) -> str:
                  _write_arms),
         "sequences": ("Random sequences: falls · height RMSE in stance [m] · planar velocity RMSE "
                       "[m/s] · yaw rate RMSE [rad/s]", _write_sequences),
-        "mpc": ("Under the controller: head's 95th percentile after arrival, of the curve its mean "
-                "[cm] (falls)", _write_mpc),
+        "mpc": (f"Under the controller, mild noise, {arguments.seeds} seeds: head's 95th "
+                "percentile after arrival, of the curve its mean, median / worst [cm] (falls)",
+                _write_mpc),
         "speed": ("One call [ms]", _write_speed),
     }  # fmt: skip
     for part, (title, write) in writers.items():
