@@ -133,7 +133,7 @@ class Constant(Term, frozen=True, tag="constant", kw_only=True):
 
 
 class Reference(Term, frozen=True, tag="reference"):
-    """Outputs of the network's reference (`Before`)."""
+    """Outputs of the network's reference (`ReferenceTable`)."""
 
 
 class Past(_Strict, frozen=True, tag_field="term", tag="past"):
@@ -195,7 +195,7 @@ class Clock(_Strict, frozen=True):
     stance: Annotated[float, Meta(gt=0, lt=1)] | None = None
 
 
-class Before(_Strict, frozen=True):
+class ReferenceTable(_Strict, frozen=True):
     """A network that turns terms into numbers which the policy's own network sees.
 
     Attributes:
@@ -252,7 +252,7 @@ class Network(_Strict, frozen=True):
     default: dict[str, float] = {}
     clip_seen: float | None = None
     clock: Clock | None = None
-    reference: Before | None = None
+    reference: ReferenceTable | None = None
     begins: Literal["zeros", "first frame"] = "zeros"
     whole_past: Positive | None = None
 

@@ -79,6 +79,8 @@ def read_table(file: Path) -> d.PolicyTable:
         if ".term" in str(error):
             terms = sorted(_tag(term) for term in (*get_args(d.Seen.__value__), d.Past))
             hint = f". Known terms: {', '.join(terms)}"
+        elif "unknown field" in str(error):
+            hint = ". docs/own_policy.md lists the keys"
         raise PolicyFileError(f"policy table '{file}': {error}{hint}") from error
 
 
