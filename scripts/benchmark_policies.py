@@ -7,7 +7,8 @@
 A policy is a name, the path of a table of your own, or either with its file or folder behind `=`.
 Parts: `speed` of one call; plain `commands` held for 10 s; `arms` held anywhere; random
 `sequences`; `mpc`, the scenarios of scripts/benchmark_tracking.py with the policy in the planner's
-rollouts. What a JSON file holds already is not run again.
+rollouts. What a JSON file holds already is not run again. `--parts rest` prints how each policy's
+standing robot leans and moves its base unasked, as its table holds it.
 """
 
 from __future__ import annotations
@@ -37,10 +38,12 @@ from xop_lerobot.low_level.comparison import (
     RESPONSES,
     SEQUENCES,
     SPEED,
+    MeasuredRest,
     hold_arms,
     make_named_arms,
     make_random_arms,
     measure_responses,
+    measure_rest,
     measure_sequences,
     measure_speeds,
     replace_table,
@@ -49,6 +52,8 @@ from xop_lerobot.low_level.policy import LowLevelPolicy, list_policies, make_pol
 from xop_lerobot.morphology.morphology import make_morphology
 
 PARTS = ("speed", "commands", "arms", "sequences", "mpc")
+REST = "rest"
+"""A part that measures for a policy's table, and is not compared."""
 HEIGHTS = (0.75, 0.55, 0.45)
 """Heights of the pelvis at which arms are held [m]."""
 SCENARIOS = ("squat", "yaw", "pitch", "diagonal", "sideways", "quarter", "curve", "arms")
@@ -216,6 +221,19 @@ def write_table(results: Results, arguments: argparse.Namespace) -> str:
     return "\n".join(lines) + "\n"
 
 
+def write_rest(rest: MeasuredRest) -> str:
+    """Write a measured rest as the table of a policy holds it."""
+
+    def write(rows: np.ndarray) -> str:
+        return "".join(f"    [{', '.join(f'{value:.3f}' for value in row)}],\n" for row in rows)
+
+    axes = ", ".join(f"{name} = {list(values)}" for name, values in rest.axes.items())
+    return (
+        f"[rest]\naxes = {{ {axes} }}\n"
+        f"pitch = [\n{write(rest.pitch)}]\nforward = [\n{write(rest.forward)}]\n"
+    )
+
+
 def _write_commands(figures: Mapping[str, Mapping[str, float]]) -> dict[str, str]:
     cells = {}
     for name, one in figures.items():
@@ -276,6 +294,10 @@ def main() -> int:
     """Run the benchmark; returns the exit code."""
     arguments = parse_arguments()
     try:
+        if arguments.parts == REST:
+            for name, path in find_policies(arguments.policies).items():
+                print(f"# {name}\n{write_rest(measure_rest(make_policy(name, path)))}")
+            return 0
         results = run_all(find_policies(arguments.policies), arguments)
     except XopError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -381,6 +381,15 @@ def test_fall_counts_height_under_the_last_quarter():
     assert evaluate_fall(make_pose([0, 0, 0.35], upright)) == pytest.approx(10 * 0.1**2)
 
 
+def test_fall_does_not_count_what_a_robot_that_squats_does():
+    """It rests low, and leans as its policy does under the executed command."""
+    cost = FallCost(0.8, 0.35, 0.75, lowest=0.42, compute_rest_tilt=lambda _command, _mode: 0.5)
+    for height, pitch, excess in ((0.42, 0.5, 0.0), (0.42, 0.7, 0.05), (0.37, 0.5, 0.015)):
+        pose = make_pose([0, 0, height], quat_from_rpy(0, pitch, 0))
+        e = make_evaluation(qpos=np.tile(pose, (1, H + 1, 1)), weights=CostWeights(fall=10.0))
+        assert cost.compute(e)[0] == pytest.approx(10 * excess**2)
+
+
 def test_fall_does_not_count_the_start():
     e = make_evaluation(qpos=np.tile(make_pose([0, 0, 0.75], [1, 0, 0, 0]), (1, H + 1, 1)))
     e.qpos[:, 0, 2] = -5

@@ -247,6 +247,36 @@ def test_g1_stands_and_walks(name: str) -> None:
     simulation.close()
 
 
+def test_g1_stops_in_any_phase_of_its_gait() -> None:
+    """From 1 m/s, with the arms held ahead as operators do: no fall, hardly a way back."""
+    n, policy = 16, make_policy("default")
+    space = make_morphology("g1").fit(policy).command_space
+    simulation, memory = make_simulation(n, threads=1), policy.initial_memory(n)
+    names, arms = make_morphology("g1").arm_names, make_morphology("g1").rest_action().arms
+    for side in ("left", "right"):
+        arms[names.index(f"{side}_shoulder_pitch_joint")] = -1.2
+        arms[names.index(f"{side}_elbow_joint")] = 1.2
+    stop = 70 + 2 * np.arange(n)  # one phase after the other, over 0.64 s
+    command, mode = np.tile(STAND, (n, 1)), np.full(n, Mode.MOBILE)
+    places = []
+    for step in range(300):
+        for i in range(n):
+            wanted = STAND + np.array([0, 0, 0, 0, 0.0 if step >= stop[i] else 1.0, 0, 0])
+            stops = space.stop_rate if step >= stop[i] else space.max_rate
+            command[i] += np.clip(wanted - command[i], -stops * 0.02, stops * 0.02)
+            if step >= stop[i] and command[i, 4] < 1e-9:  # noqa: PLR2004
+                mode[i] = Mode.STATIONARY
+        targets, memory = policy.act(
+            simulation.qpos, simulation.qvel, command, np.tile(arms, (n, 1)), memory, mode
+        )
+        simulation.step(targets)
+        assert not simulation.fallen().any()
+        places.append(simulation.qpos[:, 0].copy())
+    back = np.max(places, axis=0) - places[-1]
+    assert back.max() < 0.2  # noqa: PLR2004
+    simulation.close()
+
+
 def test_g1_squats_and_leans() -> None:
     """The pelvis follows height and pitch, the waist its three angles, and the feet stay."""
     policy, simulation = make_policy("default"), make_simulation(4, threads=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -124,6 +126,20 @@ def test_velocities_stop_smoothly_before_the_robot_is_told_to_stand():
         executed = sent
     assert executed[1] == 0
     assert 7 <= len(modes) <= 11  # 0.8 m/s at 3 m/s² are 6.7 ticks, and the two ramps
+
+
+def test_a_walk_ends_at_its_own_rate():
+    """Slower than a velocity may change while the robot walks."""
+    slow = replace(SPACE, dims=tuple(replace(dim, stop_rate=1.0) for dim in SPACE.dims))
+    smoother, executed, commands = CommandSmoother(slow, 0.04), np.array([0, 0.8, 0]), []
+    mode = Mode.MOBILE
+    while mode is Mode.MOBILE and len(commands) < 50:
+        sent, mode = smoother.smooth(np.array([0, 0.8, 0]), Mode.STATIONARY, executed, mode)
+        smoother.note(executed, sent)
+        commands.append(executed[1])
+        executed = sent
+    assert executed[1] == 0
+    assert np.abs(np.diff(commands)).max() == pytest.approx(0.04)
 
 
 def test_after_somebody_else_drove_it_starts_from_rest():

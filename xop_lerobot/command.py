@@ -36,6 +36,9 @@ class CommandDim:
             [unit]. A policy that stands may answer to a small velocity by shifting its weight.
         sway_rate: Largest change per second of an entry that sways, since haste makes a standing
             policy step [unit/s].
+        stop_rate: Largest change per second of an entry that is `mobile_only` on its way to neutral
+            once the robot is to stand, since a walk that ends too suddenly throws a robot back
+            [unit/s]; None for `max_rate`.
         max_accel: Largest change of its rate per second that a teleoperation asks for [unit/s²];
             None for no limit. `CommandSmoother` keeps it.
 
@@ -54,6 +57,7 @@ class CommandDim:
     mobile_only: bool = False
     sway: float = 0.0
     sway_rate: float = 0.1
+    stop_rate: float | None = None
     max_accel: float | None = None
 
     def __post_init__(self) -> None:
@@ -62,7 +66,7 @@ class CommandDim:
                 f"command {self.name!r} must have low <= neutral <= high, got {self.low}, "
                 f"{self.neutral}, {self.high}"
             )
-        for limit in ("max_rate", "max_accel"):
+        for limit in ("max_rate", "stop_rate", "max_accel"):
             value = getattr(self, limit)
             if value is not None and not value > 0:
                 raise BadValue(f"{limit} of command {self.name!r} must be positive, got {value}")
@@ -132,15 +136,21 @@ class CommandSpace:
         self,
         ranges: Mapping[Mode, Mapping[str, tuple[float, float]]],
         dead_zones: Mapping[str, float],
+        rates: Mapping[str, float] | None = None,
+        stop_rates: Mapping[str, float] | None = None,
     ) -> CommandSpace:
         """The part of this space that a low-level policy can do.
 
         Args:
             ranges: Bounds in each mode, by entry; entries that are not named keep theirs.
             dead_zones: Size of a velocity under which nothing happens, by entry.
+            rates: Rate limits of entries where the robot stands, in place of its own: of a
+                velocity that of its sway [its unit per second].
+            stop_rates: `CommandDim.stop_rate` of velocities, by entry.
 
         Raises:
-            BadValue: If a range and the robot's bounds have nothing in common.
+            BadValue: If a range and the robot's bounds have nothing in common, or a rate is not
+                positive.
             UnknownName: If there is no such entry.
         """
         for mode, limits in ranges.items():
@@ -151,14 +161,26 @@ class CommandSpace:
                         f"command {name!r} is {dim.low} to {dim.high} {dim.unit} for this robot, "
                         f"and the policy's range in {mode.name.lower()} mode is {least} to {most}"
                     )
-        fitted = replace(self, ranges=ranges, dead_zones=dead_zones)
+        dims = list(self.dims)
+        for name, rate in (rates or {}).items():
+            i = self.index(name)
+            if not rate > 0:
+                raise BadValue(
+                    f"the policy's rate of command {name!r} must be positive, got {rate}"
+                )
+            limit = "sway_rate" if dims[i].mobile_only else "max_rate"
+            dims[i] = replace(dims[i], **{limit: float(rate)})
+        for name, rate in (stop_rates or {}).items():
+            i = self.index(name)
+            dims[i] = replace(dims[i], stop_rate=float(rate))
+        fitted = replace(self, dims=tuple(dims), ranges=ranges, dead_zones=dead_zones)
         low = np.min([fitted.bounds(mode)[0] for mode in Mode], axis=0)
         high = np.max([fitted.bounds(mode)[1] for mode in Mode], axis=0)
-        dims = tuple(
+        bounded = tuple(
             replace(dim, low=least, high=most, neutral=min(max(dim.neutral, least), most))
-            for dim, least, most in zip(self.dims, low.tolist(), high.tolist(), strict=True)
+            for dim, least, most in zip(dims, low.tolist(), high.tolist(), strict=True)
         )
-        return replace(fitted, dims=dims)
+        return replace(fitted, dims=bounded)
 
     def extend(self, dims: tuple[CommandDim, ...]) -> CommandSpace:
         """This space with further entries behind its own."""
@@ -207,13 +229,26 @@ class CommandSpace:
     def _sway_rate(self) -> np.ndarray:
         return self._column("sway_rate")
 
+    @cached_property
+    def stop_rate(self) -> np.ndarray:
+        """Rate limits per second of a robot that stops in order to stand. Shape (k,)."""
+        rates = [
+            dim.stop_rate if dim.mobile_only and dim.stop_rate is not None else dim.max_rate
+            for dim in self.dims
+        ]
+        column = np.array(rates, dtype=float)
+        column.setflags(write=False)
+        return column
+
     def compute_max_rate(self, mode: Mode, executed: np.ndarray) -> np.ndarray:
         """Rate limits per second after `executed`. Shapes (k,) -> (k,)."""
-        if mode is Mode.MOBILE or not self._sways.any():
+        if mode is Mode.MOBILE:
             return self.max_rate
-        # What is still faster than any sway is being stopped, which is done at the full rate.
+        if not self._sways.any():
+            return self.stop_rate
+        # What is still faster than any sway is being stopped.
         sways = self.mobile_only & (np.abs(executed - self.neutral) <= self.sway + 1e-6)
-        return np.where(sways & self._sways, self._sway_rate, self.max_rate)
+        return np.where(sways & self._sways, self._sway_rate, self.stop_rate)
 
     def restrict(self, command: np.ndarray, mode: Mode) -> np.ndarray:
         """What of a command `mode` and the bounds allow. Shapes (..., k)."""

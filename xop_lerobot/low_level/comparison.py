@@ -6,7 +6,9 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from xop_lerobot.command import Mode
@@ -17,7 +19,7 @@ from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.low_level.trial import BatchSimulation, TrialResult, run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.transforms import quat_yaw
+from xop_lerobot.transforms import compute_projected_gravity, quat_yaw
 
 SEQUENCES_SEED = 1_000_000
 """Added to the seed, so that no sequence of a comparison was trained on."""
@@ -154,6 +156,93 @@ def measure_responses(policy: LowLevelPolicy, threads: int = 2) -> dict[str, dic
         name: {key: float(column[row]) for key, column in columns.items()}
         for row, name in enumerate(RESPONSES)
     }
+
+
+REST_AXES: dict[str, tuple[float, ...]] = {
+    "height": (0.42, 0.45, 0.50, 0.55, 0.60, 0.65, 0.70, 0.78),
+    "waist_pitch": (-0.5, -0.3, -0.15, 0.0, 0.15, 0.3, 0.5),
+}
+"""Commands at which it is measured how a standing robot rests."""
+
+
+class MeasuredRest(NamedTuple):
+    """How standing robots rest, arms at rest; NaN where they fell.
+
+    Attributes:
+        axes: Entries of the command and their values, those that the policy can do.
+        pitch: Pitch of the base [rad]. A row for each value of the first entry.
+        forward: Place of the base before the middle of the feet [m], the same.
+    """
+
+    axes: dict[str, tuple[float, ...]]
+    pitch: np.ndarray
+    forward: np.ndarray
+
+
+def measure_rest(policy: LowLevelPolicy, threads: int = 2) -> MeasuredRest:
+    """Measure how a policy's standing robot leans and moves its base unasked.
+
+    Each command of a grid is approached in 3 s and held for 5 s; the mean of the last 2 s counts.
+
+    Raises:
+        BadValue: If the policy has but one height, or does not pitch the waist.
+    """
+    morphology = make_morphology("g1").fit(policy)
+    space = morphology.command_space
+    low, high = space.bounds(Mode.STATIONARY)
+    axes = {
+        name: tuple(sorted({float(np.clip(value, low[i], high[i])) for value in values}))
+        for name, values in REST_AXES.items()
+        for i in [space.index(name)]
+    }
+    for name, values in axes.items():
+        if len(values) == 1:
+            raise BadValue(f"the policy has one {name}, {values[0]:g}: nothing to measure")
+    grid = np.array(np.meshgrid(*axes.values(), indexing="ij")).reshape(len(axes), -1)
+    n = grid.shape[1]
+    final = np.tile(space.neutral, (n, 1))
+    final[:, [space.index(name) for name in axes]] = grid.T
+    arms = np.tile(morphology.rest_action().arms, (n, 1))
+    simulation = make_simulation(n, threads, policy)
+    soles = _SoleFinder()
+    memory, up = policy.initial_memory(n), np.ones(n, bool)
+    pitches, places = [], []
+    for step in range(400):
+        command = space.neutral + min(step / 150, 1.0) * (final - space.neutral)
+        targets, memory = policy.act(
+            simulation.qpos, simulation.qvel, command, arms, memory, Mode.STATIONARY
+        )
+        simulation.step(targets)
+        up &= ~simulation.fallen()
+        simulation.reset(~up)
+        if step >= 300 and step % 5 == 0:  # noqa: PLR2004
+            gravity = compute_projected_gravity(simulation.qpos[:, 3:7])
+            pitches.append(np.arcsin(np.clip(gravity[:, 0], -1, 1)))
+            places.append([soles.compute_forward(qpos) for qpos in simulation.qpos])
+    simulation.close()
+    shape = tuple(len(values) for values in axes.values())
+    pitch, forward = (
+        np.where(up, np.mean(values, axis=0), np.nan).reshape(shape) for values in (pitches, places)
+    )
+    return MeasuredRest(axes, pitch, forward)
+
+
+class _SoleFinder:
+    """Finds a robot's feet."""
+
+    def __init__(self) -> None:
+        morphology = make_morphology("g1")
+        model = self._model = build_model(morphology, "planning")
+        self._data = mujoco.MjData(model)
+        self._sites = [model.site(name).id for name in morphology.contact_points]
+
+    def compute_forward(self, qpos: np.ndarray) -> float:
+        """Distance of the base before the middle of the feet, along its heading [m]."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self._data)
+        middle = self._data.site_xpos[self._sites].mean(axis=0)
+        yaw = float(quat_yaw(qpos[3:7]))
+        return float((qpos[:2] - middle[:2]) @ [np.cos(yaw), np.sin(yaw)])
 
 
 @dataclass(frozen=True)

@@ -271,6 +271,20 @@ class Motors(_Strict, frozen=True):
     torque: dict[str, float] = {}
 
 
+class Rest(_Strict, frozen=True):
+    """Where the base of a standing robot comes to rest; see `rest.RestMap`.
+
+    Attributes:
+        axes: Two entries of the command and the values at which it was measured.
+        pitch: Pitch of the base [rad], a row for each value of the first entry.
+        forward: Place of the base before the middle of the feet [m], the same.
+    """
+
+    axes: dict[str, tuple[float, ...]]
+    pitch: tuple[tuple[float, ...], ...]
+    forward: tuple[tuple[float, ...], ...]
+
+
 class PolicyTable(_Strict, frozen=True):
     """A low-level policy as data.
 
@@ -290,6 +304,11 @@ class PolicyTable(_Strict, frozen=True):
         stands_below: In mobile mode a robot stands as well while all these entries of the command
             are smaller in size.
         dead_zones: Size of a velocity under which nothing happens, by entry of the command.
+        rates: How fast the command of a robot that stands may change, by entry, in place of the
+            robot's own limits; of a velocity, by which it sways [unit of the entry per second].
+        stop_rates: How fast velocities may end where the robot is to stand, by entry, in place of
+            the robot's own limits [unit of the entry per second].
+        rest: How the base of a standing robot leans and moves unasked; None where it does not.
         handover_s: Time in which targets go over from one network's to another's [s].
     """
 
@@ -306,6 +325,9 @@ class PolicyTable(_Strict, frozen=True):
     ranges: dict[Literal["stationary", "mobile"], dict[str, tuple[float, float]]] = {}
     stands_below: dict[str, float] = {}
     dead_zones: dict[str, float] = {}
+    rates: dict[str, float] = {}
+    stop_rates: dict[str, float] = {}
+    rest: Rest | None = None
     handover_s: float = 0.2
 
     def find_part(self, mode: Mode) -> str:

@@ -14,6 +14,7 @@ from xop_lerobot.low_level import description as d
 from xop_lerobot.low_level.joints import RobotJoints, as_index
 from xop_lerobot.low_level.network_stage import NetworkStage, Situation
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
+from xop_lerobot.low_level.rest import RestMap
 from xop_lerobot.low_level.terms import FeatureColumns
 from xop_lerobot.transforms import compute_projected_gravity, quat_conjugate, quat_rotate
 
@@ -118,6 +119,9 @@ class NetworkPolicy(LowLevelPolicy):
         self.arm_limits = _join_limits(joints, table, stationary.table, mobile.table)
         self.motors = MotorSet.read(table.motors, joints)
         self.dead_zones: Mapping[str, float] = mobile.table.dead_zones
+        self.rates: Mapping[str, float] = stationary.table.rates
+        self.stop_rates: Mapping[str, float] = mobile.table.stop_rates
+        self.rest = _make_rest(stationary, joints)
         self.ranges = {
             mode: dict(stage.table.ranges.get(_name(mode), {}))
             for mode, stage in zip(Mode, (stationary, mobile), strict=True)
@@ -301,6 +305,22 @@ class NetworkPolicy(LowLevelPolicy):
 
 def _name(mode: Mode) -> Literal["stationary", "mobile"]:
     return "stationary" if mode is Mode.STATIONARY else "mobile"
+
+
+def _make_rest(stage: Stage, joints: RobotJoints) -> RestMap | None:
+    """The map of the table of what stands.
+
+    Raises:
+        BadValue: If it is malformed, or names what is no entry of the command.
+    """
+    rest = stage.table.rest
+    if rest is None:
+        return None
+    for entry in rest.axes:
+        joints.find_command(entry)
+    held = {joints.by_command.get(joint) for joint in stage.network.held}
+    names = [name for column, name in enumerate(joints.commands) if column in held]
+    return RestMap(rest.axes, rest.pitch, rest.forward, names)
 
 
 def _pair(mapping: Mapping[int, int]) -> tuple[slice | np.ndarray, slice | np.ndarray]:

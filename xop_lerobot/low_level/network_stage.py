@@ -54,6 +54,7 @@ class NetworkStage:
         memory_size: Numbers that it remembers.
         num_inputs: Width of the observation.
         sees_velocity: Whether it sees how fast the base moves.
+        held: Joints that stay at the default posture whatever is commanded.
 
     Raises:
         BadValue: If the table does not fit the robot, or the network the table.
@@ -110,7 +111,7 @@ class NetworkStage:
         self._base = as_index(moved[self._added])  # joints to whose command outputs are added
         self._centre = self._default[moved]
         self._centre[self._added] = 0.0
-        held = joints.select(action.hold)
+        held = self.held = joints.select(action.hold)
         free = [not joints.is_commanded(joint) for joint in range(len(joints.names))]
         resting = np.flatnonzero(np.isin(range(len(joints.names)), held) | free)
         self._resting, self._postures = as_index(resting), self._default[resting]

@@ -11,6 +11,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import PolicyFileError, UnknownName
+from xop_lerobot.low_level.rest import RestMap
 from xop_lerobot.registry import Registry
 
 if TYPE_CHECKING:
@@ -53,6 +54,12 @@ class LowLevelPolicy(ABC):
     """Commands that it can do in each mode, by entry, where that is less than the robot's."""
     dead_zones: Mapping[str, float] = {}
     """Size of a velocity under which nothing happens, by entry of the command."""
+    rates: Mapping[str, float] = {}
+    """Rate limits of the command where the robot stands, by entry, in place of the robot's own."""
+    stop_rates: Mapping[str, float] = {}
+    """Rate limits of velocities that end because the robot is to stand, by entry."""
+    rest: RestMap | None = None
+    """How the base of a standing robot leans and moves unasked; None where that is not known."""
 
     def adapt(self, model: mujoco.MjModel) -> None:
         """Give `model`, of a plant or of rollouts, the motors that the policy was trained with.

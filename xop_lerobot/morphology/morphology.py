@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import mujoco
 
     from xop_lerobot.low_level.policy import LowLevelPolicy
+    from xop_lerobot.low_level.rest import RestMap
 
 ModelKind = Literal["full", "planning"]
 
@@ -107,6 +108,9 @@ class Morphology(ABC):
     """`contact_points` that touch the ground together: a foot, a wheel."""
     velocity_lag_s: float = 0.3
     """Time constant with which the base takes up a velocity; wheels have none [s]."""
+    rest: RestMap | None = None
+    """How its base leans and moves unasked where it stands, under the policy that it is fitted to;
+    None for a base that does not, or of which that is not known."""
     pivot: float = 0.0
     """Forward distance from the base's frame to its centre of turning [m]."""
     support: tuple[tuple[float, float], ...] = ()
@@ -156,14 +160,17 @@ class Morphology(ABC):
         return ActionLayout(self.command_space, self.arm_names)
 
     def fit(self, policy: LowLevelPolicy) -> Morphology:
-        """This robot with the commands that `policy` can do.
+        """This robot with the commands that `policy` can do, and with how it rests.
 
         Raises:
             BadValue: If they have nothing in common with the robot's.
         """
         fitted = copy.copy(self)
         fitted.__dict__.pop("layout", None)
-        fitted.command_space = self.command_space.fit(policy.ranges, policy.dead_zones)
+        fitted.command_space = self.command_space.fit(
+            policy.ranges, policy.dead_zones, policy.rates, policy.stop_rates
+        )
+        fitted.rest = policy.rest
         return fitted
 
     def rest_action(self) -> RobotAction:

@@ -9,11 +9,14 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.command import CommandSpace, Mode
+from xop_lerobot.low_level.rest import BaseRest, RestMap
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.transforms import (
+    quat_conjugate,
     quat_from_yaw,
     quat_multiply,
+    quat_rotate,
     quat_yaw,
 )
 
@@ -35,6 +38,10 @@ class CommandModel:
         space: Its command space, or its decision space.
         effects: One effect for each entry.
         pivot: Forward distance from the base's frame to its centre of turning [m].
+        rest: How a standing base leans and moves unasked; None where it does not.
+
+    Raises:
+        UnknownName: If `rest` is about entries that are not in `space`.
     """
 
     def __init__(
@@ -43,8 +50,11 @@ class CommandModel:
         space: CommandSpace,
         effects: tuple[Effect, ...],
         pivot: float = 0.0,
+        rest: RestMap | None = None,
     ) -> None:
         self.space, self.effects, self.pivot = space, effects, pivot
+        self._rest = rest
+        self._rests = np.array([space.index(name) for name in rest.entries] if rest else [], int)
         self._shares: dict[float, np.ndarray] = {}
         self._nv = model.nv
         self._twist = [
@@ -53,7 +63,10 @@ class CommandModel:
             if effect.acts in _TWIST
         ]
         self._is_velocity = np.array([effect.acts in _TWIST for effect in effects])
-        self._follows = ~self._is_velocity
+        held = np.isin(space.names, list(rest.held) if rest else [])
+        self._follows = {
+            mode: ~self._is_velocity & ~(held & (mode is Mode.STATIONARY)) for mode in Mode
+        }
         joints = [model.joint(e.joint) if e.joint else None for e in effects]
         self._address = np.array([int(joint.qposadr[0]) if joint else 2 for joint in joints])
         self._dof = np.array([int(joint.dofadr[0]) if joint else 2 for joint in joints])
@@ -77,11 +90,15 @@ class CommandModel:
         self._body.setflags(write=False)
         self._acting = {mode: acts & self._body for mode, acts in self._modes.items()}
         self._following = {
-            mode: np.flatnonzero(acting & self._follows) for mode, acting in self._acting.items()
+            mode: np.flatnonzero(acting & self._follows[mode])
+            for mode, acting in self._acting.items()
         }
         self._moves_base = {
             mode: bool((acting & self._is_velocity).any()) for mode, acting in self._acting.items()
         }
+        # What a body that may not move does is not asked.
+        leans = bool(len(self._rests) and self._acting[Mode.STATIONARY][self._rests].any())
+        self._leans = leans
 
     def acting(self, mode: Mode) -> np.ndarray:
         """Which free entries have an effect in `mode`. Shape (k,), bool."""
@@ -132,6 +149,23 @@ class CommandModel:
             executed = np.clip(commands[:, k], executed - step, executed + step)
             limited[:, k] = executed
         return limited
+
+    def find_lowest(self) -> float:
+        """Lowest base height that can be commanded [m]; infinite where it can't be."""
+        low, _ = self.space.bounds(Mode.STATIONARY)
+        heights = [low[i] for i, effect in enumerate(self.effects) if effect.acts is Acts.HEIGHT]
+        return float(min(heights, default=math.inf))
+
+    def compute_rest_tilt(self, command: np.ndarray, mode: Mode) -> float:
+        """Tilt at which a standing base rests under a command [rad]; 0 where that is not known.
+
+        Args:
+            command: The command. Shape (k,).
+            mode: Mode of the robot; in mobile mode it does not rest.
+        """
+        if self._rest is None or mode is not Mode.STATIONARY:
+            return 0.0
+        return abs(float(self._find_rest(command).pitch))
 
     def settle(self, settled: np.ndarray, command: np.ndarray, dt: float) -> np.ndarray:
         """Command that the robot has taken up, with its lags, after `dt` [s] more. (..., k)."""
@@ -194,10 +228,14 @@ class CommandModel:
         share, address = self._compute_share(dt)[index], self._address[index]
         target = command[..., index] if offset is None else command[..., index] + offset[index]
         result[..., address] += share * (target - result[..., address])
-        if not self._moves_base[mode]:
-            return result
         if mode is Mode.STATIONARY:
-            self._sway_base(result, command, settled, dt)
+            settled = self.space.neutral if settled is None else settled
+            if self._leans:
+                self._lean_base(result, command, settled, dt)
+            if self._moves_base[mode]:
+                self._sway_base(result, command, settled, dt)
+            return result
+        if not self._moves_base[mode]:
             return result
         twist = self.compute_twist(command) + (0 if drift is None else drift)
         forward, left, turn = twist[..., 0], twist[..., 1], twist[..., 2]
@@ -212,11 +250,35 @@ class CommandModel:
         result[..., 3:7] = quat_multiply(quat_from_yaw(turn * dt), result[..., 3:7])
         return result
 
+    def _lean_base(
+        self, qpos: np.ndarray, command: np.ndarray, settled: np.ndarray, dt: float
+    ) -> None:
+        """Lean and move the base as it comes to rest under a command, in place.
+
+        What counts is the difference to how it rests under `settled`: the base of now is known.
+        """
+        assert self._rest is not None
+        before = self._find_rest(settled)
+        after = self._find_rest(settled + self._compute_share(dt) * (command - settled))
+        yaw = quat_yaw(qpos[..., 3:7])
+        forward = after.forward - before.forward
+        qpos[..., 0] += forward * np.cos(yaw)
+        qpos[..., 1] += forward * np.sin(yaw)
+        half = (after.pitch - before.pitch) / 2
+        axis = np.sin(half)
+        lean = np.stack([np.cos(half), -axis * np.sin(yaw), axis * np.cos(yaw), 0 * half], axis=-1)
+        qpos[..., 3:7] = quat_multiply(lean, qpos[..., 3:7])
+
+    def _find_rest(self, command: np.ndarray) -> BaseRest:
+        """How a standing base rests under a command. Shape (..., k)."""
+        assert self._rest is not None
+        first, second = self._rests
+        return self._rest(command[..., first], command[..., second])
+
     def _sway_base(
-        self, qpos: np.ndarray, command: np.ndarray, settled: np.ndarray | None, dt: float
+        self, qpos: np.ndarray, command: np.ndarray, settled: np.ndarray, dt: float
     ) -> None:
         """Shift the base over standing feet, in place."""
-        settled = self.space.neutral if settled is None else settled
         shift = self.compute_twist(self._sway * self._compute_share(dt) * (command - settled))
         yaw = quat_yaw(qpos[..., 3:7])
         x, y = np.cos(yaw), np.sin(yaw)
@@ -253,16 +315,48 @@ class CommandModel:
         target = command[index] if offset is None else command[index] + offset[index]
         future[address] += gain * (target - future[address])
         jacobian[self._dof[index], index] = gain * slope[index]
-        if self._moves_base[mode]:
+        stands = mode is Mode.STATIONARY
+        if self._moves_base[mode] or (stands and self._leans):
             w, x, y, z = (float(value) for value in qpos[3:7])
             yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-            if mode is Mode.STATIONARY:
+            if stands:
                 settled = self.space.neutral if settled is None else settled
+                if self._leans:
+                    self._linearise_lean(future, jacobian, command, settled, slope, share, yaw)
                 self._linearise_sway(future, jacobian, command - settled, slope, share, yaw)
             else:
                 twist = self.compute_twist(command) + (0 if drift is None else drift)
                 self._linearise_drive(future, jacobian, twist, slope, yaw, dt)
         return future, jacobian
+
+    def _linearise_lean(
+        self,
+        future: np.ndarray,
+        jacobian: np.ndarray,
+        command: np.ndarray,
+        settled: np.ndarray,
+        slope: np.ndarray,
+        share: np.ndarray,
+        yaw: float,
+    ) -> None:
+        """Lean and move the base as it comes to rest under a command; see `_lean_base`."""
+        before = self._find_rest(settled)
+        after = self._find_rest(settled + share * (command - settled))
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        forward = float(after.forward - before.forward)
+        future[0] += forward * cosine
+        future[1] += forward * sine
+        half = float(after.pitch - before.pitch) / 2
+        c, n = math.cos(half), math.sin(half)
+        lean = np.array([c, -n * sine, n * cosine, 0.0])
+        future[3:7] = quat_multiply(lean, future[3:7])
+        left = quat_rotate(quat_conjugate(future[3:7]), np.array([-sine, cosine, 0.0]))
+        for i, entry in enumerate(self._rests):
+            if self._acting[Mode.STATIONARY][entry]:
+                gain = share[entry] * slope[entry]
+                jacobian[0, entry] += gain * after.forward_slope[i] * cosine
+                jacobian[1, entry] += gain * after.forward_slope[i] * sine
+                jacobian[3:6, entry] += gain * after.pitch_slope[i] * left
 
     def _linearise_sway(
         self,

@@ -70,7 +70,7 @@ class MpcRetargeter(Retargeter):
         self.space = self.decision.space
         self.rollout = PolicyRollout(model, policy, config.num_threads)
         self.command_model = CommandModel(
-            model, self.space, self.decision.effects, morphology.pivot
+            model, self.space, self.decision.effects, morphology.pivot, morphology.rest
         )
         self.drift = DriftObserver(self.command_model, lag_s=morphology.velocity_lag_s)
         # A servo at its limit may be far from its command, and the rest of the torso has to know;
@@ -105,7 +105,13 @@ class MpcRetargeter(Retargeter):
             self._postures.load,
         )
         height = float(morphology.standing_qpos()[2])
-        self._fall = FallCost(morphology.fall_tilt, morphology.fall_height, height)
+        self._fall = FallCost(
+            morphology.fall_tilt,
+            morphology.fall_height,
+            height,
+            self.command_model.find_lowest(),
+            self.command_model.compute_rest_tilt,
+        )
         self.costs: tuple[Cost, ...] = make_costs(
             morphology,
             self.command_model,

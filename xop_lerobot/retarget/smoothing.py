@@ -16,8 +16,8 @@ class CommandSmoother:
               |a_n - 2 a_{n-1} + a_{n-2}| \le \ddot a_{max}\,dt^2
 
     It brakes in time: a wanted command that stands still is reached without overshoot, and a
-    bound is never passed. Velocities stop just so when the mode becomes stationary; the robot
-    itself would stop them at their full rate, so it is told of that mode once they are at rest.
+    bound is never passed. Velocities stop just so when the mode becomes stationary, at their rate
+    for stopping; the robot is told of that mode once they are at rest.
 
     Args:
         space: The command space; entries without a `max_accel` are limited in their rate alone.
@@ -72,7 +72,7 @@ class CommandSmoother:
         low, high = space.bounds(mode)
         rise = compute_braking_step(np.maximum(high - executed, 0), self._gain)
         fall = compute_braking_step(np.maximum(executed - low, 0), self._gain)
-        reach = space.max_rate * self.dt
+        reach = (space.stop_rate if stops else space.max_rate) * self.dt
         step = np.clip(step, -np.minimum(fall, reach), np.minimum(rise, reach))
         sent = executed + step
         if stops and self._is_at_rest(executed, sent):

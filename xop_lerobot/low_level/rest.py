@@ -1,0 +1,93 @@
+"""Where the base of a standing robot comes to rest under a command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from xop_lerobot.errors import BadValue
+
+
+class BaseRest(NamedTuple):
+    """Posture of the base at rest, and its derivatives by the command.
+
+    Attributes:
+        pitch: Pitch of the base [rad]. Shape (...).
+        forward: Place of the base before the middle of the feet [m]. Shape (...).
+        pitch_slope: Derivative of `pitch` by the two entries. Shape (..., 2).
+        forward_slope: Derivative of `forward` by the two entries. Shape (..., 2).
+    """
+
+    pitch: np.ndarray
+    forward: np.ndarray
+    pitch_slope: np.ndarray
+    forward_slope: np.ndarray
+
+
+class RestMap:
+    r"""Pitch and place of a standing robot's base as a function of two entries of its command.
+
+    A policy that balances a low or bent robot leans its pelvis and moves its hips unasked. The map
+    is measured on a grid (`scripts/benchmark_policies.py --parts rest`) and bilinear between:
+    :math:`g(a) = \sum_{ij} \lambda_i(a_1) \lambda_j(a_2) g_{ij}`; beyond the grid it stays as at
+    its edge.
+
+    Args:
+        axes: Two entries of the command and their increasing grid values.
+        pitch: Pitch of the base [rad]; a row for each value of the first entry.
+        forward: Place of the base before the middle of the feet [m], the same.
+        held: Entries whose joint does not follow: the base leans in its place.
+
+    Raises:
+        BadValue: If axes or rows do not fit.
+    """
+
+    def __init__(
+        self,
+        axes: Mapping[str, Sequence[float]],
+        pitch: Sequence[Sequence[float]],
+        forward: Sequence[Sequence[float]],
+        held: Iterable[str] = (),
+    ) -> None:
+        self.entries, self.held = tuple(axes), frozenset(held)
+        if len(axes) != 2:  # noqa: PLR2004
+            raise BadValue(
+                f"rest needs two entries of the command, got {', '.join(axes) or 'none'}"
+            )
+        self._axes = [np.array(values, dtype=float) for values in axes.values()]
+        for name, values in zip(axes, self._axes, strict=True):
+            if len(values) < 2 or (np.diff(values) <= 0).any():  # noqa: PLR2004
+                raise BadValue(f"rest: values of {name} must increase, got {values.tolist()}")
+        shape = tuple(len(values) for values in self._axes)
+        for name, rows in (("pitch", pitch), ("forward", forward)):
+            widths = {len(row) for row in rows}
+            if len(rows) != shape[0] or widths != {shape[1]}:
+                raise BadValue(f"rest: {name} must have {shape[0]} rows of {shape[1]} numbers")
+        self._values = np.stack([np.array(pitch, dtype=float), np.array(forward, dtype=float)])
+
+    def __call__(self, first: np.ndarray, second: np.ndarray) -> BaseRest:
+        """Compute the posture for values of the two entries, which broadcast. Shapes (...)."""
+        (i, s, inside_s), (j, t, inside_t) = (
+            _locate(values, np.asarray(at, dtype=float))
+            for values, at in zip(self._axes, (first, second), strict=True)
+        )
+        values = self._values
+        low, high = values[:, i, j], values[:, i + 1, j]
+        low_end, high_end = values[:, i, j + 1], values[:, i + 1, j + 1]
+        at_low, at_high = low + t * (low_end - low), high + t * (high_end - high)
+        by_first = (at_high - at_low) * inside_s
+        by_second = ((1 - s) * (low_end - low) + s * (high_end - high)) * inside_t
+        pitch, forward = at_low + s * (at_high - at_low)
+        slopes = np.stack([by_first, by_second], axis=-1)
+        return BaseRest(pitch, forward, slopes[0], slopes[1])
+
+
+def _locate(values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cell, share of it, and slope of the share (zero beyond the grid)."""
+    cell = np.clip(np.searchsorted(values, at, side="right") - 1, 0, len(values) - 2)
+    width = values[cell + 1] - values[cell]
+    share = (at - values[cell]) / width
+    inside = (share >= 0) & (share <= 1)
+    return cell, np.clip(share, 0.0, 1.0), inside / width
