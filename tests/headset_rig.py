@@ -116,7 +116,7 @@ class Rig:
     def compute_largest_steps(self, since: int = 0) -> tuple[float, float]:
         """Largest step of a command against its rate limit, and of an arm joint [rad]."""
         commands = np.array([action.command for action, _ in self.ticks[since:]])
-        limit = self.morphology.command_space.max_rate / FPS
+        limit = self.teleop.morphology.command_space.max_rate / FPS
         num_joints = self.teleop._arms.ik.num_joints
         arms = np.array([action.arms for action, _ in self.ticks[since:]])[:, :num_joints]
         steps = np.abs(np.diff(commands, axis=0)) / limit

@@ -347,7 +347,7 @@ changes = st.fixed_dictionaries(
 
 
 def assert_smooth(r: Rig, commands: list[np.ndarray], arms: list[np.ndarray]) -> None:
-    space, dt = r.morphology.command_space, r.dt
+    space, dt = r.teleop.morphology.command_space, r.dt
     steps = np.diff(commands, axis=0)
     assert (np.abs(steps) <= space.max_rate * dt + 1e-6).all()
     assert (np.abs(np.diff(steps, axis=0)) <= space.max_accel * dt**2 + 2e-6).all()

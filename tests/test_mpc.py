@@ -44,8 +44,8 @@ class Bench:
         config: RetargeterConfig = SMALL,
         model: mujoco.MjModel | None = None,
     ) -> None:
-        self.morphology = morphology
         policy = make_policy(POLICIES[morphology.name])
+        self.morphology = morphology = morphology.fit(policy)
         model = model or build_model(morphology, "planning")
         plant = Simulation(morphology, SimulationConfig(), kind="planning")
         self.loop = PolicyLoop(morphology, plant, policy)

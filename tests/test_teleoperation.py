@@ -146,7 +146,7 @@ def rig() -> Iterator[Callable[..., Rig]]:
 
 def assert_no_step(rig: Rig, ticks: list[tuple[RobotAction, TickRecord]]) -> None:
     """No command, and no arm, moves faster than the robot may."""
-    space = rig.morphology.command_space
+    space = rig.teleop.morphology.command_space
     for (before, _), (after, _) in zip(ticks[:-1], ticks[1:], strict=True):
         assert (np.abs(after.command - before.command) <= space.max_rate * rig.dt + 1e-6).all()
         num_joints = rig.teleop._arms.ik.num_joints
