@@ -58,6 +58,10 @@ TRACE_DT = 0.2
 OPEN_PINCH = 0.1  # distance of thumb and index of an open hand [m]
 
 
+SETTLE_S, LOADED_SETTLE_S = 1.0, 3.0
+"""Time in which a robot settles before a scenario begins, and one with a payload [s]."""
+
+
 class GoalDevice(Device):
     """An operator who has the goals themselves as head and hands, in the robot's world.
 
@@ -213,7 +217,8 @@ def run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory
     retargeter = make_retargeter_config(setup, seed)
     teleoperation = Teleoperation(TeleoperationConfig(retargeter=retargeter), info)
     try:
-        loop.reset(seed)
+        # What is put into the hands makes a robot sink and lean before it has found its balance.
+        loop.reset(seed, settle_s=LOADED_SETTLE_S if setup.payload else SETTLE_S)
         truth = _Truth(morphology)
         frames = truth.compute_frames(loop.state.true_qpos)
         home = frames["head"]
