@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import grpc
 import numpy as np
+from ports import find_port
 
 from xop_lerobot.operator.devices.avp_protocol import (
     AXES,
@@ -71,7 +72,7 @@ class AvpServer:
         self._server.add_generic_rpc_handlers(
             (grpc.method_handlers_generic_handler(SERVICE, {"StreamHandUpdates": handler}),)
         )
-        self.port = self._server.add_insecure_port(f"127.0.0.1:{port}")
+        self.port = self._server.add_insecure_port(f"127.0.0.1:{port or find_port()}")
         assert self.port
         self._server.start()
 

@@ -30,8 +30,9 @@ import psutil
 from avp_server import AvpServer
 from avp_server import encode as encode_avp
 from headset_rig import make_person
+from ports import find_port
 from websockets.exceptions import InvalidMessage, WebSocketException
-from webxr_client import CODE, Page, encode, find_port
+from webxr_client import CODE, Page, encode
 
 MAX_CHUNK = 65_536
 """Most bytes that go over one connection at once."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import fcntl
 import hashlib
 import json
 import shutil
@@ -25,8 +26,11 @@ RUNTIME = "package/build/iwer.min.js"
 def load_runtime() -> str:
     """The emulator's script, from the cache or from npm; skips where neither has it."""
     archive = CACHE / f"iwer-{VERSION}.tgz"
-    if not archive.exists():
-        _fetch(archive)
+    CACHE.mkdir(parents=True, exist_ok=True)
+    with (CACHE / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # another worker of pytest may be fetching it
+        if not archive.exists():
+            _fetch(archive)
     digest = base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode()
     assert f"sha512-{digest}" == INTEGRITY, f"{archive} is not iwer {VERSION}; delete it"
     with tarfile.open(archive) as packed:
@@ -38,7 +42,6 @@ def load_runtime() -> str:
 def _fetch(archive: Path) -> None:
     if shutil.which("npm") is None:
         pytest.skip(f"needs iwer {VERSION}, and there is no npm to fetch it")
-    CACHE.mkdir(parents=True, exist_ok=True)
     command = ["npm", "pack", f"iwer@{VERSION}", "--pack-destination", str(CACHE)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=CACHE)

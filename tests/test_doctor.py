@@ -16,6 +16,7 @@ from typing import cast
 import numpy as np
 import pytest
 from avp_server import AvpServer
+from ports import find_port
 from websockets.exceptions import ConnectionClosed
 from webxr_client import Page
 
@@ -33,12 +34,6 @@ from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.certificate import get_certificate
 from xop_lerobot.transforms import make_pose, quat_exp
-
-
-def find_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_interpreter(monkeypatch):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 import pytest
+from ports import find_port
 
 from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.errors import BadShape, BadValue, UnknownName
@@ -581,7 +582,7 @@ def test_browser_view_follows_the_simulation(
 
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    simulation = make_toy(viewer=True, viewer_port=18412)
+    simulation = make_toy(viewer=True, viewer_port=find_port())
     viewer = simulation._viewer
     assert isinstance(viewer, BrowserViewer)
     assert f"The simulation can be watched at {viewer.url}" in capsys.readouterr().out
@@ -660,7 +661,7 @@ def test_a_display_that_does_not_answer_leads_to_the_browser_view(
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":9797")
-    simulation = make_toy(viewer=True, viewer_port=18413)
+    simulation = make_toy(viewer=True, viewer_port=find_port())
     try:
         assert isinstance(simulation._viewer, BrowserViewer)
         assert "no window can be opened" in caplog.text

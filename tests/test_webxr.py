@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from avp_server import wait_for
 from PIL import Image
+from ports import find_port
 from swaying import make_person
-from webxr_client import CODE, Page, encode, find_port
+from webxr_client import CODE, Page, encode
 
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue

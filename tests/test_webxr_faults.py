@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from avp_server import wait_for
 from headset_rig import RATE, Rig, make_person
+from ports import find_port
 from test_headset_faults import move, turn
-from webxr_client import AHEAD_S, CODE, Page, encode, find_port
+from webxr_client import AHEAD_S, CODE, Page, encode
 
 from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.devices.webxr import WebXrDevice

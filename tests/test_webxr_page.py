@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import json
-import socket
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from desk import CODE, Desk, wait_for
 from PIL import Image
+from ports import find_port
 
 from xop_lerobot.command import Mode
 from xop_lerobot.operator.display import Cue, Progress, Wish
@@ -37,12 +37,6 @@ def browser() -> Iterator[Any]:
 
     with launch() as started:
         yield started
-
-
-def find_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture

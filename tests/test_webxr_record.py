@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from headset_rig import RETARGETER
 from lerobot.datasets import LeRobotDataset
+from ports import find_port
 
 from xop_lerobot.dataset.facts import read_facts
 
@@ -147,10 +148,7 @@ def drive(page: Any) -> None:
 def test_from_engage_to_save(tmp_path):
     from browser import launch
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    root = tmp_path / "webxr"
+    port, root = find_port(), tmp_path / "webxr"
     with (
         launch() as browser,
         record(root, port, f"--teleop.retargeter.type={RETARGETER}") as process,

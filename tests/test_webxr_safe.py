@@ -21,10 +21,11 @@ import pytest
 from avp_server import wait_for
 from browser import launch
 from cryptography import x509
+from ports import find_port
 from swaying import make_person
 from test_webxr import send
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from webxr_client import CODE, Page, encode, find_port
+from webxr_client import CODE, Page, encode
 
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.devices.webxr import WebXrDevice

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import ssl
 import threading
 import time
@@ -23,11 +22,6 @@ from xop_lerobot.transforms import quat_from_matrix
 CODE = "TESTCODE"
 AHEAD_S = 1000.0
 """By how much the page's clock is ahead of the server's, in lock-step [s]."""
-
-
-def find_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return free.getsockname()[1]
 
 
 def to_webxr(pose: np.ndarray) -> list[float]:
