@@ -4,6 +4,8 @@
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 SOURCES := xop_lerobot robots teleoperators scripts tests
+# A worker for each core, up to four; a file's tests stay together, and share what they set up.
+PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile
 
 # Render without a display. One BLAS thread each: the planner brings its own threads.
 export MUJOCO_GL ?= egl
@@ -23,10 +25,10 @@ setup:  ## Make .venv and install the project (the other verbs do it by themselv
 demo: setup  ## Record and show one episode of each robot, in outputs/demo
 	@$(PYTHON) scripts/demo.py
 
-test: setup  ## Lint, then run the tests; what they skipped and why stands at the end
+test: setup  ## Lint, then run the tests on all cores; what they skipped and why stands at the end
 	@$(PYTHON) scripts/setup.py --test-tools
 	@$(PYTHON) -m ruff check --quiet $(SOURCES)
-	@$(PYTHON) -m pytest -q
+	@$(PYTHON) -m pytest -q $(PARALLEL)
 
 format: setup  ## Format the code and apply the linter's safe fixes
 	@$(PYTHON) -m ruff format $(SOURCES)

@@ -416,11 +416,20 @@ def test_make_test_brings_the_tools_before_it_tests() -> None:
     assert places == sorted(places)
 
 
-def test_what_is_skipped_is_told_at_the_end_with_its_reason(tmp_path: Path) -> None:
+def read_parallel() -> list[str]:
+    """How `make test` spreads the tests."""
+    (flags,) = re.findall(r"^PARALLEL := (.*)$", (ROOT / "Makefile").read_text(), re.M)
+    return flags.split()
+
+
+@pytest.mark.parametrize("flags", [read_parallel(), [], ["-p", "no:xdist"]], ids=" ".join)
+def test_what_is_skipped_is_told_at_the_end_with_its_reason(
+    tmp_path: Path, flags: list[str]
+) -> None:
     (tmp_path / "test_it.py").write_text(
         "import pytest\ndef test_page():\n    pytest.skip('needs Chromium: get it')\n"
     )
-    command = [sys.executable, "-m", "pytest", "-q", "-c", ROOT / "pyproject.toml"]
+    command = [sys.executable, "-m", "pytest", "-q", *flags, "-c", ROOT / "pyproject.toml"]
     done = subprocess.run(
         [*command, "--rootdir", tmp_path, "-p", "no:cacheprovider", tmp_path / "test_it.py"],
         capture_output=True,
@@ -483,7 +492,8 @@ def test_pip_sees_nothing_of_another_python(
 def test_the_lock_pins_every_dependency_and_no_broken_mujoco() -> None:
     lines = (ROOT / "requirements.lock").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
-    assert {"mujoco", "lerobot", "mink", "daqp", "torch", "accelerate", "pytest"} <= set(pins)
+    assert {"mujoco", "lerobot", "mink", "daqp", "torch", "accelerate"} <= set(pins)
+    assert {"pytest", "pytest-xdist"} <= set(pins)
     assert pins["lerobot"] == "0.6.1"
     assert int(pins["mujoco"].split(".")[0]) < 4, "4.0.0 has a wrong sparse Newton Hessian"
     assert not any("xop" in name for name in pins)
