@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _TRIES = 2
 """How often a worker may die over one episode before the run is given up."""
-_HEAVY = ("lerobot.datasets", "mujoco", "onnxruntime")
+_HEAVY = ("xop_lerobot.dataset.collect_worker", "mujoco", "onnxruntime")
 """What takes the workers long to import; done once where processes can be forked."""
 
 
