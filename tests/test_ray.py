@@ -34,6 +34,7 @@ def cluster() -> Iterator[None]:
         folders = ("tests", "teleoperators", "robots", ".")
         patch.setenv("PYTHONPATH", os.pathsep.join(str(REPO / name) for name in folders))
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")  # by itself Ray gives way to tests beside it
         ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False)
         yield
         ray.shutdown()
