@@ -10,6 +10,7 @@ from lerobot.robots.config import RobotConfig
 from xop_lerobot.dataset.rollout_pictures import watch_rollouts
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
+from xop_lerobot.tasks.heights import parse_heights
 from xop_lerobot.tasks.task import get_task
 from xop_lerobot.yaml_words import fill_nulls, find_text, find_word, recover_typed
 
@@ -54,6 +55,7 @@ class XopRobotConfig(RobotConfig):
     fps: int = 25  # rate of the control loop [Hz]; divides 50 and equals --dataset.fps
     clock: str = "lockstep"  # lockstep: time passes in send_action alone; realtime: wall clock
     task: str = ""  # task with its furniture: dual_point_touch, …; none where it is empty
+    task_heights: str = ""  # heights over the task's own, as support=0.35,table=0.6:0.7 [m]
     seed: int = 0  # the same seed gives the same episodes, bit for bit, in lockstep
     cameras: list[str] | str = field(
         default_factory=lambda: ["head"]
@@ -71,11 +73,17 @@ class XopRobotConfig(RobotConfig):
         """Check every value. LeRobot's own check expects camera objects and is left out.
 
         Raises:
-            BadValue: If a number is out of its range, with the range.
+            BadValue: If a number is out of its range, with the range, or there are heights without
+                a task.
             UnknownName: If there is no such task, clock or noise, with the known ones.
         """
         fill_nulls(self)
         self.task, self.sim.scene = find_text(self.task), find_text(self.sim.scene)
+        self.task_heights = find_text(self.task_heights)
+        if parse_heights(self.task_heights) and not self.task:
+            raise BadValue(
+                f"robot.task_heights={self.task_heights} is for a task. Give it with --robot.task"
+            )
         recover_typed(self, "robot", "session")
         recover_typed(self.low_level, "robot.low_level", "path")
         if self.fps < 1 or POLICY_HZ % self.fps:

@@ -18,6 +18,7 @@ from xop_lerobot.mistakes import report_mistakes
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_scene_spec
 from xop_lerobot.tasks.camera import add_task_camera
+from xop_lerobot.tasks.task import make_task
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
@@ -38,7 +39,9 @@ class XopRobot(Robot):
         config: The robot's configuration.
 
     Raises:
-        UnknownName: If there is no such policy for this robot, no such task, scene or camera.
+        UnknownName: If there is no such policy for this robot, no such task, height, scene or
+            camera.
+        BadValue: If the task's heights are out of the robot's reach.
         PolicyFileError: If the policy's file is missing or not what it should be.
     """
 
@@ -51,6 +54,8 @@ class XopRobot(Robot):
         self.config = config
         self.morphology = make_morphology(config.morphology)
         _check_cameras(self.morphology, config)
+        if config.task_heights:
+            make_task(config.task, self.morphology, config.task_heights)
         policy_name = resolve_policy(self.morphology, config.low_level.name)
         self._policy = make_policy(policy_name, config.low_level.path)
         self.morphology = self.morphology.fit(self._policy)
@@ -136,7 +141,7 @@ class XopRobot(Robot):
         config = self.config.make_simulation_config()
         if not self.config.task:
             return Simulation(self.morphology, config)
-        self._stage = Stage(self.morphology, self.config.task, config)
+        self._stage = Stage(self.morphology, self.config.task, config, self.config.task_heights)
         return self._stage.plant
 
     def _start_episode(self) -> None:

@@ -40,6 +40,7 @@ class CollectConfig:
         only_successful: Whether episodes that did not succeed are left out.
         video: Whether pictures are stored as h264 video, else as PNG.
         scene: Scene that the robot stands in; empty takes the task's own.
+        heights: Heights over the task's usual ones; see `Task.choose_heights`.
         device: Operator device that drives the robot.
         plugins: Modules that are imported first, and may register robots, tasks and devices.
     """
@@ -59,6 +60,7 @@ class CollectConfig:
     only_successful: bool = False
     video: bool = True
     scene: str = ""
+    heights: str = ""
     device: str = "simulated"
     plugins: tuple[str, ...] = ()
 
@@ -66,7 +68,7 @@ class CollectConfig:
         """Check all that can be checked before a robot is made; imports the plugins.
 
         Raises:
-            UnknownName: If there is no such robot, task, policy, noise, method or device.
+            UnknownName: If there is no such robot, task, height, policy, noise, method or device.
             BadValue: If a number is out of its range, or a plugin cannot be imported.
         """
         from xop_lerobot.operator.devices import make_device  # noqa: PLC0415 MuJoCo
@@ -80,6 +82,8 @@ class CollectConfig:
         """Return what must be the same for two runs to work on one dataset, fit for JSON."""
         settings = dataclasses.asdict(self)
         del settings["plugins"]
+        if not self.heights:  # as in collections that were made before there were any
+            del settings["heights"]
         return {**settings, "cameras": list(self.cameras)}
 
     def describe(self, attempt: Attempt) -> str:
@@ -111,11 +115,12 @@ class CollectConfig:
         """Make the task, to read its instruction, time limit and scene.
 
         Raises:
-            UnknownName: Listing the known tasks.
+            UnknownName: If there is no such task or height, listing the known ones.
+            BadValue: If the heights are malformed, or out of the robot's reach.
         """
         from xop_lerobot.tasks.task import make_task  # noqa: PLC0415 MuJoCo
 
-        return make_task(self.task, self.morphology)
+        return make_task(self.task, self.morphology, self.heights)
 
     def make_robot_config(self) -> XopRobotConfig:
         """Make the configuration of the robot as a LeRobot device.
@@ -133,6 +138,7 @@ class CollectConfig:
         kind: type[XopRobotConfig] = RobotConfig.get_choice_class(f"xop_{self.robot}")
         return kind(
             task=self.task,
+            task_heights=self.heights,
             fps=self.fps,
             seed=self.seed,
             cameras=list(self.cameras),

@@ -42,6 +42,7 @@ def add_config(
     add("method", "mpc, mpc_no_sync, mpc_table1, direct or direct_amo")
     add("variant", "binding, constraints and preset with _ between, such as v2_upright")
     add("scene", "scene; empty: the task's own")
+    add("heights", "heights over the task's own, as support=0.35,table=0.6:0.7 [m]")
     add("plugins", "modules to import first, with commas between", type=split)
     parser.add_argument(
         "--images", action="store_true", help="store pictures as PNG and not as h264 video"

@@ -50,6 +50,8 @@ def make_parser() -> CommandParser:
     add("--seed", type=int, help="seed of the first trial; the same for every method (default: 0)")
     add("--noise", help="sensor noise: off, mild or harsh (default: mild)")
     add("--scene", help="scene (default: the task's own)")
+    add("--heights", help="heights over the task's own, as support=0.35,table=0.6:0.7 or "
+        "points=0.3:0.5 [m] (default: the task's own)")  # fmt: skip
     add("--fps", type=int, help="rate of the control loop, divides 50 [Hz] (default: 25)")
     add("--time-limit", type=float,
         help="time after which an episode is cut off [s] (default: the task's own)")  # fmt: skip
@@ -101,7 +103,7 @@ def make_study(args: argparse.Namespace) -> list[Any]:
 
     if args.noise is not None and args.noise not in NOISE_PRESETS:
         raise UnknownName("noise preset", args.noise, NOISE_PRESETS)
-    names = ("trials", "seed", "noise", "fps", "time_limit", "scene")
+    names = ("trials", "seed", "noise", "fps", "time_limit", "scene", "heights")
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     if args.low_level_path is not None:
         given["low_level_paths"] = _parse_paths(args.low_level_path)
@@ -229,7 +231,7 @@ def _run_jobs(cells: Sequence[Any], results: Any, jobs: Sequence[Any], workers: 
 def describe(setup: Any) -> str:
     """Robot, task, method, variant and low-level policy in words."""
     method = f"{setup.method} {setup.variant}".strip()
-    return f"{setup.robot} {setup.task} {method} ({setup.low_level})"
+    return f"{setup.robot} {setup.place} {method} ({setup.low_level})"
 
 
 def describe_outcome(record: Mapping[str, Any]) -> str:
@@ -268,7 +270,7 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
         lines.append(
             (
                 row["robot"],
-                row["task"],
+                f"{row['task']} {row['heights']}".strip(),
                 f"{row['method']} {row['variant']}".strip(),
                 row["low_level"],
                 *counts,

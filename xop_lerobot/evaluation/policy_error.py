@@ -44,6 +44,7 @@ class Setting:
         low_level: Low-level policy.
         fps: Rate of the control loop [Hz].
         seed: Seed of the session.
+        heights: Heights over the task's usual ones.
     """
 
     robot: str
@@ -53,6 +54,7 @@ class Setting:
     low_level: str
     fps: int
     seed: int
+    heights: str = ""
 
 
 @dataclass(frozen=True)
@@ -260,6 +262,7 @@ def _read_setting(source: Source) -> Setting:
         low_level=str(facts[0]["low_level"]),
         fps=int(source.fps),
         seed=int(facts[0]["seed"]),
+        heights=str(robot.get("task_heights", "")),
     )
 
 
@@ -275,7 +278,7 @@ def _check_length(source: Source, entry: EpisodeEntry, frames: int) -> None:
 
 def _make_stage(setting: Setting) -> Stage:
     config = SimulationConfig(scene=setting.scene, noise=setting.noise)
-    return Stage(make_morphology(setting.robot), setting.task, config)
+    return Stage(make_morphology(setting.robot), setting.task, config, setting.heights)
 
 
 def _find_offsets(stage: Stage) -> list[np.ndarray]:

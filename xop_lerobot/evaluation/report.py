@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -70,13 +71,14 @@ def write_report(
     parts = [_make_head(cells, found)]
     groups: dict[tuple[str, str], list[int]] = {}
     for index, cell in enumerate(cells):
-        groups.setdefault((cell.setup.robot, cell.setup.task), []).append(index)
-    for (robot, task), members in groups.items():
+        groups.setdefault((cell.setup.robot, cell.setup.place), []).append(index)
+    for (robot, place), members in groups.items():
         chosen = [cells[i] for i in members]
         trials = [found[i] for i in members]
-        parts.append(f"<h2>{escape(f'{robot}: {task}')}</h2>")
-        parts.append(_make_table(chosen, trials, [rows[i] for i in members], robot, task))
-        parts += _make_plots(folder, f"{robot}-{task}", chosen, trials)
+        parts.append(f"<h2>{escape(f'{robot}: {place}')}</h2>")
+        # The paper's are at heights of its own.
+        parts.append(_make_table(chosen, trials, [rows[i] for i in members], robot, place))
+        parts += _make_plots(folder, re.sub(r"[^\w.-]+", "-", f"{robot}-{place}"), chosen, trials)
         parts += _make_films(folder, chosen, trials, results, videos)
     page = folder / PAGE
     body = "\n".join(parts)

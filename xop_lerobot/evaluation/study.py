@@ -93,6 +93,8 @@ def compute_key(setup: TrialSetup, seed: int) -> str:
     plain = dataclasses.asdict(dataclasses.replace(setup, low_level_path=""))
     if setup.low_level_path:  # where it lies tells nothing, what it holds does
         plain["low_level_path"] = _digest_path(setup.low_level_path)
+    if not setup.heights:  # as trials that were run before there were any
+        del plain["heights"]
     text = json.dumps(plain, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
     parts = (setup.robot, setup.task, setup.method, setup.variant, setup.low_level)
@@ -275,6 +277,7 @@ def summarise(cell: Cell, trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]
         "low_level": setup.low_level,
         "noise": setup.noise,
         "scene": setup.scene,
+        "heights": setup.heights,
         "fps": setup.fps,
         "tilt_std": _std(values("tilt")),
         "jerk_std": _std(values("jerk")),

@@ -18,7 +18,7 @@ from xop_lerobot.yaml_words import find_word, load_yaml
 
 _STUDY_KEYS = ("trials", "seed", "noise", "fps", "time_limit", "low_level_paths", "groups")
 _LISTS = ("tasks", "methods", "variants", "low_levels")
-_GROUP_KEYS = ("robot", *_LISTS, "trials", "noise", "scene")
+_GROUP_KEYS = ("robot", *_LISTS, "trials", "noise", "scene", "heights")
 
 
 def load_study(path: Path, overrides: Mapping[str, Any] | None = None) -> list[Cell]:
@@ -28,8 +28,8 @@ def load_study(path: Path, overrides: Mapping[str, Any] | None = None) -> list[C
         path: YAML file: `trials`, `seed`, `noise`, `fps`, `time_limit`, `low_level_paths` (file
             or folder of a low-level policy by its name), and a list of `groups`; each has a
             `robot` and lists of `tasks` and `methods`, and may have lists of `variants` and
-            `low_levels`, and `trials`, `noise` and `scene` of its own. Every combination within
-            a group is a cell.
+            `low_levels`, and `trials`, `noise`, `scene` and `heights` of its own. Every combination
+            within a group is a cell.
         overrides: Values over those of the file and of all its groups (`trials`, `seed`,
             `noise`, …); None leaves a value.
 
@@ -70,8 +70,10 @@ def make_cells(group: Mapping[str, Any]) -> list[Cell]:
         UnknownName: If a name is unknown, listing the known ones.
         BadValue: If a number is out of its range.
     """
-    kept = ("noise", "scene", "fps", "time_limit")
+    kept = ("noise", "scene", "fps", "time_limit", "heights")
     common = {name: group[name] for name in kept if group.get(name)}
+    if "heights" in common:
+        common["heights"] = str(common["heights"])
     if group.get("noise") is not None:
         common["noise"] = find_word(group["noise"], NOISE_PRESETS)
         if common["noise"] not in NOISE_PRESETS:

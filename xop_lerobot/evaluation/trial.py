@@ -48,6 +48,7 @@ class TrialSetup:
         low_level_path: Its file; empty for its default.
         noise: Preset of the sensors' noise.
         scene: Scene; empty for the task's own.
+        heights: Heights over the task's usual ones; see `Task.choose_heights`.
         fps: Rate of the control loop [Hz].
         time_limit: Time after which the episode is cut off, if its task has not ended it [s];
             0 for the task's own limit.
@@ -63,6 +64,12 @@ class TrialSetup:
     scene: str = ""
     fps: int = 25
     time_limit: float = 0.0
+    heights: str = ""
+
+    @property
+    def place(self) -> str:
+        """The task, with its heights where they are not its own, in words."""
+        return f"{self.task} {self.heights}".strip()
 
     @property
     def resolved(self) -> TrialSetup:
@@ -70,11 +77,12 @@ class TrialSetup:
 
         Raises:
             UnknownName: If a name is unknown, listing the known ones.
-            BadValue: If the variant contradicts itself or the method.
+            BadValue: If the variant contradicts itself or the method, or the heights are out of
+                the robot's reach.
         """
         morphology = make_morphology(self.robot)
         make_retargeter_config(morphology, self.method, self.variant)
-        task = type(make_task(self.task, morphology))
+        task = make_task(self.task, morphology, self.heights)
         return dataclasses.replace(
             self,
             low_level=resolve_low_level(morphology, self.method, self.low_level),
@@ -236,7 +244,7 @@ def make_stage(setup: TrialSetup, seed: int) -> Stage:
     from xop_lerobot.tasks.stage import Stage  # noqa: PLC0415
 
     config = SimulationConfig(scene=setup.scene, noise=setup.noise, seed=seed)
-    return Stage(make_morphology(setup.robot), setup.task, config)
+    return Stage(make_morphology(setup.robot), setup.task, config, setup.heights)
 
 
 def make_teleoperation(setup: TrialSetup, seed: int, morphology: Morphology) -> Teleoperation:

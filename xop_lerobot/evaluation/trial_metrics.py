@@ -224,6 +224,7 @@ _SETTINGS = (
     "low_level",
     "noise",
     "scene",
+    "heights",
     "fps",
     "time_limit",
 )

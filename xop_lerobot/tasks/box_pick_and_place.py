@@ -10,6 +10,7 @@ import numpy as np
 
 from xop_lerobot.operator.view import SeenObject
 from xop_lerobot.tasks import furniture
+from xop_lerobot.tasks.heights import HeightRange
 from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import (
     find_palms,
@@ -65,6 +66,9 @@ TABLE_DISTANCE = (0.95, 1.15)
 LEVELS = {"support": (-0.03, 0.03), "table": (-0.06, 0.0)}
 """Heights of the tops about that at which the box's middle is where palms are at rest [m]."""
 
+TOPS = {"g1": (0.30, 1.10), "rby1": (0.30, 1.30)}
+"""Heights at which tops may be asked for, by robot [m]: hands get beside a box on them."""
+
 WRIST_GAP = 0.01
 """Between the end of the arm, which is thicker than the hand, and the box [m]."""
 LIFT, LIFTED_S = 0.03, 3.0
@@ -99,6 +103,13 @@ class BoxPickAndPlace(Task):
         self._palms = tuple(find_palms(morphology, model).values())
         self._draw_in = measure_draw_in(morphology)
         self._lifted, self._placed = Hold(LIFTED_S), Hold(PLACED_S)
+
+    @property
+    def height_limits(self) -> Mapping[str, HeightRange]:
+        """Where the tops of support and table may be."""
+        level = self.reach.height - BOX[2]
+        usual = (level + LEVELS["table"][0], level + LEVELS["support"][1])
+        return dict.fromkeys(self.furniture, TOPS.get(self.morphology.name, usual))
 
     @property
     def hints(self) -> Mapping[str, float]:
@@ -156,7 +167,7 @@ class BoxPickAndPlace(Task):
         bearing = rng.uniform(-BEARING, BEARING)
         facing = bearing + rng.uniform(-BEARING, BEARING) / 2
         box = (self.reach.forward + rng.uniform(*GAP)) * make_direction(bearing)
-        top = level + rng.uniform(*LEVELS["support"])
+        top = self.draw_height(rng, "support", level, LEVELS["support"])
         offset = SUPPORT[0] - BOX[0] - SPOT
         quat = quat_from_yaw(facing)
         furniture.place(
@@ -169,7 +180,7 @@ class BoxPickAndPlace(Task):
         turn = rng.choice([-1, 1]) * rng.uniform(*TURN)
         spot = rng.uniform(*TABLE_DISTANCE) * make_direction(turn)
         facing = turn + rng.uniform(-BEARING, BEARING) / 2
-        top = level + rng.uniform(*LEVELS["table"])
+        top = self.draw_height(rng, "table", level, LEVELS["table"])
         middle = spot - self._spot_offset * make_direction(facing) + [0, 0, top]
         furniture.place(self.plant, "table", middle, quat_from_yaw(facing))
 

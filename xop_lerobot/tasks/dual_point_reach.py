@@ -9,12 +9,15 @@ import numpy as np
 
 from xop_lerobot.tasks.dual_point_touch import DualPointTouch
 from xop_lerobot.tasks.furniture import place
+from xop_lerobot.tasks.heights import HeightRange
 from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import make_direction
 from xop_lerobot.tasks.task import TASKS
 from xop_lerobot.transforms import quat_from_yaw
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from xop_lerobot.morphology.morphology import Morphology
 
 HOLD_S = 1.0
@@ -49,6 +52,11 @@ class DualPointReach(DualPointTouch):
     def __init__(self, morphology: Morphology) -> None:
         super().__init__(morphology)
         self._hold = Hold(HOLD_S)
+
+    @property
+    def height_limits(self) -> Mapping[str, HeightRange]:
+        """None: the points are near where the palms are at rest."""
+        return {}
 
     def reset(self, rng: np.random.Generator) -> None:
         """Place both points."""

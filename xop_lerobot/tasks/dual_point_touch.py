@@ -10,6 +10,7 @@ import numpy as np
 
 from xop_lerobot.operator.view import SeenObject
 from xop_lerobot.tasks.furniture import add_furniture_body, add_look, get_body_pose, place
+from xop_lerobot.tasks.heights import HeightRange
 from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import find_palms, find_room, make_direction, measure_reach
 from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
@@ -34,6 +35,8 @@ HEIGHT_SPREAD = 0.27
 """Heights of the middle about that of the palms at rest; low ones need a squat [m]."""
 LEVEL_SPREAD, DEPTH_SPREAD = 0.08, 0.04
 """Largest difference of each point's height and depth from the middle's [m]."""
+POINTS = {"g1": (0.25, 1.30), "rby1": (0.25, 1.50)}
+"""Heights at which points may be asked for, by robot [m]: hands get there."""
 FACING_SPREAD = 0.6
 """By how much the points face aside from where the robot sees them at the start [rad]."""
 NEAR_WALL = (0.25, 0.40)
@@ -70,6 +73,13 @@ class DualPointTouch(Task):
         self._hold = Hold(HOLD_S)
         self._success = False
 
+    @property
+    def height_limits(self) -> Mapping[str, HeightRange]:
+        """Where the points may be."""
+        spread = HEIGHT_SPREAD + LEVEL_SPREAD
+        usual = (self.reach.height - spread, self.reach.height + spread)
+        return {"points": POINTS.get(self.morphology.name, usual)}
+
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add two balls that touch nothing, on thin rods for the eye."""
         for index, (name, colour) in enumerate(COLOURS.items()):
@@ -88,17 +98,24 @@ class DualPointTouch(Task):
         """Place both points."""
         near_wall = self._room is not None and rng.random() < WALL_SHARE
         middle, facing = self._draw_near_wall(rng) if near_wall else self._draw_in_open(rng)
-        middle[2] = self.reach.height + rng.uniform(-HEIGHT_SPREAD, HEIGHT_SPREAD)
+        spread, about = self._compute_level_spread(), self.reach.height
+        usual = (-HEIGHT_SPREAD, HEIGHT_SPREAD)
+        middle[2] = self.draw_height(rng, "points", about, usual, margin=spread)
         ahead, left = make_direction(facing), make_direction(facing + math.pi / 2)
         half = rng.uniform(*APART) / 2
         depth = 0.0 if near_wall else rng.uniform(-DEPTH_SPREAD, DEPTH_SPREAD)
-        level = rng.uniform(-LEVEL_SPREAD, LEVEL_SPREAD)
+        level = rng.uniform(-spread, spread)
         offset = half * left + depth * ahead + np.array([0, 0, level])
         for name, sign in (("left_point", 1), ("right_point", -1)):
             place(self.plant, name, middle + sign * offset, quat_from_yaw(facing))
         self.facing = facing
         self._hold.reset()
         self._success = False
+
+    def _compute_level_spread(self) -> float:
+        """Largest difference of a point's height from the middle's [m]."""
+        low, high = self.heights.get("points", (-math.inf, math.inf))
+        return min(LEVEL_SPREAD, (high - low) / 2)
 
     def _draw_in_open(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
         """Middle and heading, such that a robot has room to stand before them."""

@@ -43,6 +43,7 @@ class Stage:
         task: Name of the task.
         config: Settings of the plant. Without any, or with an empty `scene`, the task's own
             scene for the robot.
+        heights: Heights over the task's usual ones; see `Task.choose_heights`.
 
     Attributes:
         plant: The robot among the furniture.
@@ -51,13 +52,18 @@ class Stage:
         start: Action to begin with: the robot at rest, its arms as the task wants them.
 
     Raises:
-        UnknownName: If there is no such task or scene; lists the known ones.
+        UnknownName: If there is no such task, height or scene; lists the known ones.
+        BadValue: If the heights are malformed, or out of the robot's reach.
     """
 
     def __init__(
-        self, morphology: Morphology, task: str, config: SimulationConfig | None = None
+        self,
+        morphology: Morphology,
+        task: str,
+        config: SimulationConfig | None = None,
+        heights: str = "",
     ) -> None:
-        self.morphology, self.task = morphology, make_task(task, morphology)
+        self.morphology, self.task = morphology, make_task(task, morphology, heights)
         config = config or SimulationConfig(scene="")
         self.scene = find_scene(self.task, config.scene)
         spec = build_scene_spec(morphology, "full", self.scene)

@@ -12,6 +12,7 @@ import numpy as np
 from xop_lerobot.link import Outcome
 from xop_lerobot.operator.view import SeenObject
 from xop_lerobot.registry import Registry
+from xop_lerobot.tasks.heights import HeightRange, check_heights, parse_heights
 
 if TYPE_CHECKING:
     import mujoco
@@ -67,8 +68,52 @@ class Task(ABC):
     passable: tuple[str, ...] = ()
     """Geoms of `furniture` over which hands work, so that a planner must not keep clear of them."""
 
+    heights: Mapping[str, HeightRange] = {}
+    """Heights that a user asks for, by name; the others are drawn as usual."""
+
     def __init__(self, morphology: Morphology) -> None:
         self.morphology = morphology
+
+    @property
+    def height_limits(self) -> Mapping[str, HeightRange]:
+        """Heights that a user may ask for, by name, and where the robot can work at them [m]."""
+        return {}
+
+    def choose_heights(self, text: str) -> None:
+        """Draw places from other heights than usual, from the next `reset` on.
+
+        Args:
+            text: As `parse_heights` reads it.
+
+        Raises:
+            UnknownName: If the task has no such height, listing those that it has.
+            BadValue: If it is malformed, or out of the robot's reach.
+        """
+        heights = parse_heights(text)
+        check_heights(heights, self.height_limits, self.name, self.morphology.name)
+        self.heights = heights
+
+    def draw_height(
+        self,
+        rng: np.random.Generator,
+        name: str,
+        about: float,
+        spread: HeightRange,
+        margin: float = 0.0,
+    ) -> float:
+        """Draw a height over the floor [m].
+
+        Args:
+            rng: Source; one number is drawn of it in either case.
+            name: Of what.
+            about: Height about which it usually is [m].
+            spread: How far below and above it usually is [m].
+            margin: Stay so far within the ends of a range that a user asks for [m].
+        """
+        if name in self.heights:
+            low, high = self.heights[name]
+            return float(rng.uniform(low + margin, high - margin))
+        return about + rng.uniform(*spread)
 
     @property
     def hints(self) -> Mapping[str, float]:
@@ -105,13 +150,21 @@ class Task(ABC):
 TASKS: Registry[type[Task]] = Registry("task")
 
 
-def make_task(name: str, morphology: Morphology) -> Task:
+def make_task(name: str, morphology: Morphology, heights: str = "") -> Task:
     """Make the task `name` for a robot.
 
+    Args:
+        name: Name of the task.
+        morphology: The robot.
+        heights: Heights over the task's usual ones; see `Task.choose_heights`.
+
     Raises:
-        UnknownName: Listing the known tasks.
+        UnknownName: If there is no such task or height, listing the known ones.
+        BadValue: If the heights are malformed, or out of the robot's reach.
     """
-    return get_task(name)(morphology)
+    task = get_task(name)(morphology)
+    task.choose_heights(heights)
+    return task
 
 
 def get_task(name: str) -> type[Task]:
