@@ -18,6 +18,8 @@ MODE_WAIT = 1.4
 """Longest wait for the display to show the other mode [s]."""
 GLANCE = 0.9
 """Turn of the head with which a person looks to a side [rad]."""
+RISEN = 0.02
+"""A head that has come up so far is rising [m]."""
 MODE_TRIES = 6
 """How often a person tries a double pinch before giving up."""
 MOST_STUCK = 3
@@ -71,7 +73,10 @@ def glance(mind: Mind, *names: str) -> Doing:
 
 
 def set_mode(mind: Mind, mode: Mode) -> Doing:
-    """Pinch twice with the left hand, and look at the display whether it took."""
+    """Pinch twice with the left hand, and look at the display whether it took.
+
+    A robot that squats stands up before it walks: who sees it rise waits.
+    """
     if mind.eyes.mode is mode:
         return
     for _ in range(MODE_TRIES):
@@ -80,9 +85,11 @@ def set_mode(mind: Mind, mode: Mode) -> Doing:
         yield from mind.pause(0.2)
         mind.body.double_pinch("left")
         yield from mind.finish()
-        limit = mind.time + MODE_WAIT
+        limit, height = mind.time + MODE_WAIT, mind.eyes.pose("head")[2]
         while mind.eyes.mode is not mode and mind.time < limit:
             yield
+            if mind.eyes.pose("head")[2] > height + RISEN:
+                limit, height = mind.time + MODE_WAIT, mind.eyes.pose("head")[2]
         if mind.eyes.mode is mode:
             return
     raise GaveUp(f"could not change to {mode.name.lower()}")
