@@ -11,7 +11,9 @@ from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.devices.simulated import SimulatedDevice
 from xop_lerobot.operator.noise import HumanNoise
-from xop_lerobot.operator.simulated.body import Body
+from xop_lerobot.operator.simulated.body import Body, relaxed_hands
+from xop_lerobot.operator.simulated.box_pick_and_place import bring_up
+from xop_lerobot.operator.simulated.hands import LARGEST_BEND
 from xop_lerobot.operator.simulated.intentions import INTENTIONS
 from xop_lerobot.operator.simulated.perception import Perception
 from xop_lerobot.operator.simulated.person import Person, draw_person
@@ -83,6 +85,57 @@ def test_looks_to_both_sides_before_it_turns_round() -> None:
     run_touch(world, device)
     assert world.success
     assert not any("turn round" in text for _, text in device.mind.diary)
+
+
+@pytest.mark.parametrize("height", [0.3, 0.4])
+def test_squats_and_bends_for_what_is_low(height: float) -> None:
+    world, device = ToyWorld(make_points(height=height)), make_person(3)
+    standing = world.frames["head"][2]
+    assert run_touch(world, device) < 0.05
+    assert world.success
+    person, posture = device.mind.person, device.mind.body.posture
+    assert posture.drop == person.leg_bend
+    assert 0.3 < posture.bend <= LARGEST_BEND
+    # The head is lower than by the knees alone, and looks down with the trunk.
+    knees = person.leg_bend * device.mind.belief.scale
+    assert world.frames["head"][2] < standing - knees - 0.02
+    assert posture.look[1] >= posture.bend
+
+
+def test_stands_upright_where_a_squat_will_do() -> None:
+    world, device = ToyWorld(make_points(height=0.55)), make_person(3)
+    assert run_touch(world, device) < 0.05
+    posture = device.mind.body.posture
+    assert 0 < posture.drop < device.mind.person.leg_bend
+    assert posture.bend == 0
+
+
+def test_looks_down_for_what_is_known_to_be_low_at_its_feet() -> None:
+    objects = make_points(bearing=0.0, distance=0.5, height=0.3)
+    said = []
+    for hints in ({"lowest": 0.3}, {}):
+        world, device = ToyWorld(objects), make_person(3)
+        view = world.view
+        world.view = lambda view=view, hints=hints: replace(view(), hints=hints)
+        run_touch(world, device, 8.0)
+        said.append([text for _, text in device.mind.diary[:2]])
+    assert said[0][0] == "look down"
+    assert "look to both sides" not in said[0]
+    assert said[1][0] == "look to both sides"
+
+
+def test_lifts_what_it_took_from_below_to_a_good_height() -> None:
+    world, device = ToyWorld(make_points()), make_person(3)
+    for _ in range(10):
+        world.step(device)
+    mind = device.mind
+    _ = mind.belief
+    hands = relaxed_hands(mind.person.size)
+    low = hands + np.array([0.2, 0, -0.4, 0, 0, 0, 0])
+    raised = bring_up(mind, low)
+    assert raised[:, 2].mean() == pytest.approx(-mind.person.reach_low * mind.person.size)
+    assert raised[:, 0].mean() < low[:, 0].mean()
+    assert raised[0, 1] - raised[1, 1] == pytest.approx(low[0, 1] - low[1, 1])
 
 
 def test_same_seed_same_person_and_another_is_another() -> None:

@@ -134,8 +134,13 @@ class Stage:
             mode=state.mode,
             fallen=state.fallen,
             success=self.status.success,
-            hints=self.task.hints,
+            hints={**self.task.hints, **self._find_lowest()},
         )
+
+    def _find_lowest(self) -> dict[str, float]:
+        """The hint `lowest`, where heights are asked for: the least of them [m]."""
+        lows = [low for low, _ in self.task.heights.values()]
+        return {"lowest": min(lows)} if lows else {}
 
     def close(self) -> None:
         """Close the plant; may be called twice."""

@@ -41,6 +41,10 @@ BOB = (0.010, 0.012)
 """Amplitude of the head up and down, and sideways, at 0.6 m/s [m]."""
 NECK = 0.45
 """How far the eyes go forward with a nod, of trunk and neck in equal parts [m/rad]."""
+TRUNK = 0.70
+"""From the hips to the eyes [m], for eyes at 1.6 m."""
+HIPS_BACK = 0.20
+"""How far the hips go back under a trunk that bends, to keep the balance [m/rad]."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +53,12 @@ class Posture:
 
     Attributes:
         place: Where the person stands in the own room, and the heading, x y yaw. Shape (3,).
-        drop: How far the eyes are lowered [m].
+        drop: How far the eyes are lowered by the knees [m].
         lean: How far the head is moved ahead and to the left of where the person stands [m].
             Shape (2,).
         look: Turn of the head to the left and down, against the body [rad]. Shape (2,).
         hands: Wrists, left and right, from the head along the body's heading. Shape (2, 7).
+        bend: How far the trunk is bent forward at the hips; `look` has it, too [rad].
     """
 
     place: np.ndarray
@@ -61,13 +66,21 @@ class Posture:
     lean: np.ndarray
     look: np.ndarray
     hands: np.ndarray
+    bend: float = 0.0
 
     def compute_frame(self, eye_height: float) -> np.ndarray:
         """Place of the head with the heading of the body, without turn and nod. Shape (7,)."""
         turn = quat_from_yaw(self.place[2])
-        lean = np.array([self.lean[0] + NECK * np.sin(self.look[1]), self.lean[1], 0])
-        position = np.array([*self.place[:2], eye_height - self.drop])
+        ahead = self.lean[0] + NECK * np.sin(self.look[1]) - HIPS_BACK * np.sin(self.bend)
+        lean = np.array([ahead, self.lean[1], 0])
+        sunk = self.drop + compute_sinking(self.bend, eye_height)
+        position = np.array([*self.place[:2], eye_height - sunk])
         return make_pose(position + quat_rotate(turn, lean), turn)
+
+
+def compute_sinking(bend: float, eye_height: float) -> float:
+    """How far a bend of the trunk [rad] lowers the eyes [m]."""
+    return TRUNK * eye_height / Person.eye_height * (1 - float(np.cos(bend)))
 
 
 def relaxed_hands(scale: float = 1.0) -> np.ndarray:
@@ -80,6 +93,12 @@ def relaxed_hands(scale: float = 1.0) -> np.ndarray:
             for side in (1, -1)
         ]
     )
+
+
+def stand_upright(posture: Posture, hands: np.ndarray | None = None) -> Posture:
+    """The same without squat, lean, bend and nod; with other hands, where some are given."""
+    hands = posture.hands if hands is None else hands
+    return Posture(posture.place, 0.0, np.zeros(2), np.zeros(2), hands)
 
 
 class Body:
@@ -232,6 +251,7 @@ class Body:
             lean=start.lean + u * (end.lean - start.lean),
             look=start.look + u * (end.look - start.look),
             hands=interpolate_poses(start.hands, end.hands, u),
+            bend=start.bend + u * (end.bend - start.bend),
         )
 
     def _compute_bob(self) -> np.ndarray:

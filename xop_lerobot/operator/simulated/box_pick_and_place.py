@@ -8,7 +8,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import SIDES, relaxed_hands
+from xop_lerobot.operator.simulated.body import SIDES, TRUNK, relaxed_hands, stand_upright
 from xop_lerobot.operator.simulated.grasping import (
     CARRY_SPEED,
     LIFTED,
@@ -23,8 +23,11 @@ from xop_lerobot.operator.simulated.grasping import (
     open_hands,
 )
 from xop_lerobot.operator.simulated.hands import (
+    HAND,
     compute_distance,
+    compute_draw,
     compute_reach,
+    go_down,
     lean,
     plan_posture,
     shift_hands,
@@ -64,6 +67,8 @@ PLACE_NEAR = 0.04
 OPENINGS, DONE_S = 3, 2.5
 """How often a person takes the hands farther off a box, and how long they look whether it counts
 [s]."""
+OVER = 0.015
+"""Height of a box over the table from which one carries it there [m]."""
 LOWERINGS, BY_KNEES, KNEES_SPEED = 6, 0.03, 0.08
 """How often a person lowers a box before letting it go anyway, from what height on it bends the
 knees for it [m], and how fast [m/s]."""
@@ -146,7 +151,8 @@ def keep_distance(mind: Mind) -> Doing:
     """Lean back, or ahead, to have the box at the distance at which arms work well."""
     head, box = mind.eyes.pose("head"), mind.eyes.pose("box")
     ahead = compute_ahead(float(compute_heading(head[3:])))
-    error = float((box - head)[:3] @ ahead) - compute_reach(mind) - FARTHER
+    usual = compute_reach(mind) + FARTHER - compute_draw(mind, [box[:3]])
+    error = float((box - head)[:3] @ ahead) - usual
     mind.note(f"box {100 * error:.0f} cm too far")
     if abs(error) > 0.5 * STAND_NEAR:
         yield from lean(mind, {"both": error * ahead})
@@ -162,6 +168,7 @@ def walk_to_table(mind: Mind) -> Doing:
     back = np.array([*(head[:3] - BACK * compute_ahead(heading))[:2], heading])
     yield from go_to(mind, back, hands=hands, laden=True, tolerance=0.15, tries=2)
     yield from find(mind, "spot")
+    yield from lift_over_table(mind)
     for _ in range(3):
         check_held(mind)
         heading = choose_heading(mind, "spot")
@@ -181,10 +188,36 @@ def straighten_up(mind: Mind) -> Doing:
     across /= np.linalg.norm(across)
     for i in range(2):
         room[i][:3] -= (1 - 2 * i) * FIRMER / mind.belief.scale * across
-    end = replace(last, drop=0.0, lean=np.zeros(2), look=np.zeros(2))
-    body.move(body.with_hands_in_room(end, dict(zip(SIDES, room, strict=True))), STRAIGHTEN_S)
+    end = body.with_hands_in_room(stand_upright(last), dict(zip(SIDES, room, strict=True)))
+    if last.bend:
+        end = replace(end, hands=bring_up(mind, end.hands))
+    body.move(end, max(STRAIGHTEN_S, (last.drop + TRUNK * last.bend) / mind.person.posture_speed))
     yield from mind.settle()
     check_held(mind)
+
+
+def bring_up(mind: Mind, hands: np.ndarray) -> np.ndarray:
+    """Hands that would hang far down, once one stands, at a good height and distance instead.
+
+    Args:
+        mind: Who stands up.
+        hands: Wrists, from the head along the body's heading. Shape (2, 7).
+    """
+    ahead = (compute_reach(mind) + FARTHER) / mind.belief.scale - HAND
+    good = np.array([ahead, 0.0, -mind.person.reach_low * mind.person.size])
+    way = good - hands[:, :3].mean(axis=0)
+    raised = hands.copy()
+    raised[:, :3] += np.array([min(way[0], 0.0), 0.0, max(way[2], 0.0)])
+    return raised
+
+
+def lift_over_table(mind: Mind) -> Doing:
+    """Lift the box, if it is not well over the table that it goes to."""
+    lack = OVER - compute_height_over_spot(mind)
+    if lack > 0:
+        mind.note(f"lift it over the table by {100 * lack:.0f} cm")
+        yield from shift_hands(mind, np.array([0, 0, lack]), CARRY_SPEED)
+        yield from mind.settle("left_palm", "right_palm")
 
 
 def compute_carry_place(mind: Mind, heading: float) -> np.ndarray:
@@ -238,9 +271,14 @@ def put_down(mind: Mind) -> Doing:
 def bend_knees(mind: Mind, way: float) -> Doing:
     """Go down with all that one holds, by so much of the robot's height [m]."""
     last = mind.body.posture
-    drop = min(last.drop + way / mind.belief.scale, mind.person.leg_bend)
+    way /= mind.belief.scale
+    drop = min(last.drop + way, mind.person.leg_bend)
     mind.note(f"bend the knees by {100 * (drop - last.drop):.0f} cm")
-    mind.body.move(replace(last, drop=drop), max(1.0, (drop - last.drop) / KNEES_SPEED))
+    end = replace(last, drop=drop)
+    left = way - (drop - last.drop)
+    if left > 0:
+        end = go_down(mind, end, left)
+    mind.body.move(end, max(1.0, way / KNEES_SPEED))
     yield from mind.finish()
 
 

@@ -8,6 +8,7 @@ from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.body import SIDES
 from xop_lerobot.operator.simulated.hands import (
+    compute_bend,
     compute_distance,
     compute_errors,
     compute_pointing,
@@ -39,8 +40,9 @@ def touch_two_points(mind: Mind) -> Doing:
     for approach in range(APPROACHES):
         place = plan_place(mind, closer)
         miss, turn = compute_miss(mind, place)
-        # The first time almost there is near enough; then it was not.
-        near = mind.person.place_tolerance * (2.0 if not approach else 0.5)
+        # The first time almost there is near enough, but for who has to bend; then it was not.
+        bends = compute_bend(mind, list(get_points(mind).values())) > 0
+        near = mind.person.place_tolerance * (2.0 if not (approach or bends) else 0.5)
         if miss > near or abs(turn) > mind.person.heading_tolerance:
             yield from set_mode(mind, Mode.MOBILE)
             yield from go_to(mind, place, tolerance=min(near, mind.person.place_tolerance))

@@ -7,7 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from xop_lerobot.operator.simulated.body import NECK, SIDES, Posture
+from xop_lerobot.operator.simulated.body import (
+    HIPS_BACK,
+    NECK,
+    SIDES,
+    TRUNK,
+    Posture,
+    compute_sinking,
+)
 from xop_lerobot.operator.simulated.mind import Doing, Mind
 from xop_lerobot.transforms import (
     make_pose,
@@ -26,7 +33,11 @@ MARGIN = 0.08
 NOD_MORE = 0.08
 """Least further nod when a hand is not in view [rad]."""
 LARGEST_NOD = 0.45
-"""Largest nod [rad]."""
+"""Largest nod of who does not bend [rad]."""
+LARGEST_BEND = 0.65
+"""Largest bend of the trunk [rad]."""
+LOW_REACH = 0.9
+"""Share of the arm's length that hands use for what is that low."""
 KNEES = 0.1
 """How much farther out hands work for each metre of squatting [m/m]."""
 STRETCHED = 0.8
@@ -53,27 +64,75 @@ def plan_posture(mind: Mind, points: list[np.ndarray]) -> Posture:
     """How to hold the body so that points of the robot's world are at a good height.
 
     Within a comfortable range below the eyes a person stands upright; for what is lower the
-    person squats, and nods to see it.
+    person squats, and nods to see it; for what is lower than that, bends, too.
     """
     look = np.array([0.0, compute_nod(mind, points)])
-    drop = compute_drop(mind, points)
-    return replace(mind.body.posture, drop=drop, lean=np.zeros(2), look=look)
+    drop, bend = compute_drop(mind, points), compute_bend(mind, points)
+    return replace(mind.body.posture, drop=drop, lean=np.zeros(2), look=look, bend=bend)
 
 
 def compute_nod(mind: Mind, points: list[np.ndarray]) -> float:
     """Nod with which points are well in view, from where they are worked at best [rad]."""
-    eyes = mind.person.eye_height - compute_drop(mind, points)
+    bend = compute_bend(mind, points)
+    eyes = compute_eyes(mind, points)
     lowest = eyes - mind.belief.height_to_own(float(min(point[2] for point in points)))
-    angle = np.arctan2(mind.belief.scale * lowest, compute_reach(mind))
+    ahead = compute_reach(mind) - compute_draw(mind, points)
+    angle = np.arctan2(mind.belief.scale * lowest, ahead)
     nod = angle - mind.person.view_half_angles[1] + MARGIN
-    return float(np.clip(nod, 0.0, LARGEST_NOD))
+    return float(np.clip(nod, bend, max(LARGEST_NOD, bend)))
 
 
 def compute_drop(mind: Mind, points: list[np.ndarray]) -> float:
     """How far a person squats for points of the robot's world [m, own]."""
+    return float(np.clip(_compute_lack(mind, points), 0.0, mind.person.leg_bend))
+
+
+def compute_bend(mind: Mind, points: list[np.ndarray]) -> float:
+    """How far a person bends the trunk for points that are too low for a squat [rad].
+
+    The trunk makes up for half of what the knees leave, the arms, which hang, for the rest.
+    """
+    lack = _compute_lack(mind, points) - mind.person.leg_bend
+    if lack <= 0:
+        return 0.0
+    return min(float(np.arccos(1 - min(lack / 2 / (TRUNK * mind.person.size), 1))), LARGEST_BEND)
+
+
+def compute_eyes(mind: Mind, points: list[np.ndarray]) -> float:
+    """Height of the eyes of who squats and bends for points of the robot's world [m, own]."""
+    eyes = mind.person.eye_height
+    return eyes - compute_drop(mind, points) - compute_sinking(compute_bend(mind, points), eyes)
+
+
+def compute_draw(mind: Mind, points: list[np.ndarray]) -> float:
+    """By how much nearer to the eyes than usual who bends has the hands [m, robot].
+
+    A trunk that bends brings the eyes ahead of the shoulders, and arms that reach down do not
+    reach as far ahead.
+    """
+    bend, size = compute_bend(mind, points), mind.person.size
+    if not bend:
+        return 0.0
+    ahead, up = _turn_down(SHOULDER[0], SHOULDER[2], bend)
+    point = mind.belief.height_to_own(float(np.mean(points, axis=0)[2]))
+    depth = compute_eyes(mind, points) + size * up - point
+    length = LOW_REACH * size * (sum(ARM) + HAND)
+    farthest = size * ahead + float(np.sqrt(max(length**2 - depth**2, 0.0)))
+    usual = compute_reach(mind) + mind.belief.scale * KNEES * compute_drop(mind, points)
+    return max(usual - mind.belief.scale * farthest, 0.0)
+
+
+def _compute_lack(mind: Mind, points: list[np.ndarray]) -> float:
+    """How far below where hands work well the points are, for who stands upright [m, own]."""
     person, middle = mind.person, np.mean(points, axis=0)
     below = person.eye_height - mind.belief.height_to_own(float(middle[2]))
-    return float(np.clip(below - person.reach_low * person.size, 0.0, person.leg_bend))
+    return below - person.reach_low * person.size
+
+
+def _turn_down(ahead: float, up: float, bend: float) -> tuple[float, float]:
+    """What is `ahead` and `up` of the eyes [m], after the trunk has bent by `bend` [rad]."""
+    cos, sin = float(np.cos(bend)), float(np.sin(bend))
+    return ahead * cos + up * sin, up * cos - ahead * sin
 
 
 def compute_reach(mind: Mind) -> float:
@@ -91,27 +150,56 @@ def compute_distance(mind: Mind, points: list[np.ndarray]) -> float:
     Who nods brings the eyes forward; who squats has the knees ahead, and works farther out.
     """
     knees = mind.belief.scale * KNEES * compute_drop(mind, points)
-    return compute_reach(mind) + knees + NECK * float(np.sin(compute_nod(mind, points)))
+    nod, bend = compute_nod(mind, points), compute_bend(mind, points)
+    eyes = NECK * float(np.sin(nod)) - HIPS_BACK * float(np.sin(bend))
+    return compute_reach(mind) - compute_draw(mind, points) + knees + eyes
 
 
 def is_stretched(mind: Mind, side: str, point: np.ndarray) -> bool:
     """Whether the arm has to be stretched, or nearly so, to bring the palm to a point."""
     frame = mind.body.posture.compute_frame(mind.person.eye_height)
     target = mind.belief.point_to_own(point, mind.body.compute_head())
-    left = 1.0 if side == "left" else -1.0
-    shoulder = _apply(frame, mind.person.size * np.array(SHOULDER) * [1, left, 1])
+    shoulder = _apply(frame, mind.person.size * _compute_shoulder(mind, side))
     reach = float(np.linalg.norm(target - shoulder))
-    return reach > STRETCHED * mind.person.size * (sum(ARM) + HAND)
+    share = LOW_REACH if mind.body.posture.bend else STRETCHED
+    return reach > share * mind.person.size * (sum(ARM) + HAND)
+
+
+def _compute_shoulder(mind: Mind, side: str) -> np.ndarray:
+    """Shoulder from the eyes along the body's heading, for eyes at 1.6 m. Shape (3,)."""
+    ahead, up = _turn_down(SHOULDER[0], SHOULDER[2], mind.body.posture.bend)
+    return np.array([ahead, SHOULDER[1] * (1.0 if side == "left" else -1.0), up])
 
 
 def take_posture(mind: Mind, posture: Posture) -> Doing:
     """Squat, rise or nod; the hands go along with the head."""
     last = mind.body.posture
     way = abs(posture.drop - last.drop) + float(np.linalg.norm(posture.lean - last.lean))
+    way += TRUNK * abs(posture.bend - last.bend)
     turn = float(np.linalg.norm(posture.look - last.look))
     duration = max(way / mind.person.posture_speed, 1.875 * turn / mind.person.turn_speed)
     mind.body.move(posture, max(duration, 0.4))
     yield from mind.settle("head")
+
+
+def go_down(mind: Mind, posture: Posture, way: float) -> Posture:
+    """Bend the trunk of a posture whose knees are bent, and lower the hands by as much in the room.
+
+    Args:
+        mind: Who goes down.
+        posture: Where from; its hands are held before the body.
+        way: How far the hands shall go down [m, own].
+    """
+    eye_height = mind.person.eye_height
+    trunk = TRUNK * mind.person.size
+    sunk = compute_sinking(posture.bend, eye_height)
+    bend = float(np.arccos(1 - min((sunk + way / 2) / trunk, 1)))
+    bend = max(min(bend, LARGEST_BEND), posture.bend)
+    room = mind.body.compute_hands_in_room(posture)
+    room[:, 2] -= way
+    look = np.array([posture.look[0], max(posture.look[1], bend)])
+    lower = replace(posture, bend=bend, look=look)
+    return mind.body.with_hands_in_room(lower, dict(zip(SIDES, room, strict=True)))
 
 
 def look_at_work(mind: Mind, points: Mapping[str, np.ndarray]) -> Doing:
@@ -177,7 +265,7 @@ def compute_pointing(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
     frame = body.posture.compute_frame(mind.person.eye_height)
     back = pose_inverse(frame)
     target = _apply(back, belief.point_to_own(point, body.compute_head())) / size
-    shoulder = np.array(SHOULDER) * [1, left, 1]
+    shoulder = _compute_shoulder(mind, side)
     pole = np.array([-0.2, 0.35 * left, -1.0])
     forearm = np.array([1.0, 0, 0])
     for _ in range(5):  # the wrist is where the hand, straight on the forearm, ends at the point

@@ -8,7 +8,7 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import Posture, relaxed_hands
+from xop_lerobot.operator.simulated.body import Posture, relaxed_hands, stand_upright
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
 from xop_lerobot.transforms import quat_from_yaw, quat_rotate, quat_to_rpy, wrap_angle
 
@@ -18,6 +18,10 @@ MODE_WAIT = 1.4
 """Longest wait for the display to show the other mode [s]."""
 GLANCE = 0.9
 """Turn of the head with which a person looks to a side [rad]."""
+LOW = 0.5
+"""Share of the robot's height under which things at its feet are not seen by who looks ahead."""
+LOOK_DOWN, LOOK_DOWN_S = 0.45, 1.0
+"""Nod with which a person looks for them [rad], and its time [s]."""
 RISEN = 0.02
 """A head that has come up so far is rising [m]."""
 MODE_TRIES = 6
@@ -46,6 +50,8 @@ def find(mind: Mind, *names: str) -> Doing:
         yield
     yield from mind.pause(mind.person.decision_s)
     if not _knows(mind, names):
+        yield from look_down(mind, names)
+    if not _knows(mind, names):
         mind.note("look to both sides")
         yield from glance(mind, *names)
     if _knows(mind, names):
@@ -58,6 +64,17 @@ def find(mind: Mind, *names: str) -> Doing:
     yield from _search(mind, names)
     if not _knows(mind, names):
         raise GaveUp(f"did not find {', '.join(names)}")
+
+
+def look_down(mind: Mind, names: tuple[str, ...]) -> Doing:
+    """Look down for what is not known yet, if it is known to be low; and stay so."""
+    head = float(mind.eyes.pose("head")[2])
+    if mind.eyes.recall("lowest", head) > LOW * head:
+        return
+    mind.note("look down")
+    last = mind.body.posture
+    mind.body.move(replace(last, look=np.array([last.look[0], LOOK_DOWN])), LOOK_DOWN_S)
+    yield from _search(mind, names)
 
 
 def glance(mind: Mind, *names: str) -> Doing:
@@ -192,9 +209,7 @@ def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, straight: bool, pac
     What the steps to the side did not bring, the person then goes straight for (`straight`).
     """
     body, person = mind.body, mind.person
-    upright = replace(
-        body.posture, drop=0.0, lean=np.zeros(2), look=np.zeros(2), hands=hands.copy()
-    )
+    upright = stand_upright(body.posture, hands.copy())
     changed = body.posture.drop + float(np.abs(body.posture.lean).sum())
     if changed + float(np.abs(body.posture.look).sum()) > 0.01 or not np.allclose(
         body.posture.hands, hands, atol=1e-3
