@@ -50,6 +50,8 @@ APART = 0.12
 too, as far as the robot's arms allow, not to sweep it off its support in a turn."""
 STAND_NEAR = 0.04
 """How far beside where it wants to stand before the box is good enough [m]."""
+BEND_NEAR = 0.06
+"""How much too far a box may be for who bends [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""
 HOLD_S = 3.6
@@ -109,7 +111,7 @@ def walk_to_box(mind: Mind) -> Doing:
     heading = choose_heading(mind, "box")
     box = mind.eyes.pose("box")[:3]
     ahead = compute_ahead(heading)
-    distance = compute_distance(mind, [box]) + FARTHER
+    distance = compute_distance(mind, [box], FARTHER)
     place = np.array([*(box - distance * ahead)[:2], heading])
     miss, turn = compute_miss(mind, place)
     if miss > STAND_NEAR or abs(turn) > mind.person.heading_tolerance:
@@ -130,7 +132,7 @@ def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
         harder: How much more than is known to be enough the hands press [m].
     """
     box = mind.eyes.pose("box")[:3]
-    yield from take_posture(mind, plan_posture(mind, [box]))
+    yield from take_posture(mind, plan_posture(mind, [box], FARTHER))
     yield from keep_distance(mind)
     press = mind.eyes.recall("press", PRESS)
     for attempt in range(GRASPS):
@@ -148,13 +150,20 @@ def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
 
 
 def keep_distance(mind: Mind) -> Doing:
-    """Lean back, or ahead, to have the box at the distance at which arms work well."""
+    """Lean back, or ahead, to have the box at the distance at which arms work well.
+
+    Raises:
+        OutOfReach: If it is too far for who bends, whom a lean does not bring any farther.
+    """
     head, box = mind.eyes.pose("head"), mind.eyes.pose("box")
     ahead = compute_ahead(float(compute_heading(head[3:])))
-    usual = compute_reach(mind) + FARTHER - compute_draw(mind, [box[:3]])
-    error = float((box - head)[:3] @ ahead) - usual
+    error = float((box - head)[:3] @ ahead) - compute_reach(mind) - FARTHER
+    error += compute_draw(mind, [box[:3]], FARTHER)
     mind.note(f"box {100 * error:.0f} cm too far")
-    if abs(error) > 0.5 * STAND_NEAR:
+    if mind.body.posture.bend:
+        if error > BEND_NEAR:
+            raise OutOfReach
+    elif abs(error) > 0.5 * STAND_NEAR:
         yield from lean(mind, {"both": error * ahead})
 
 

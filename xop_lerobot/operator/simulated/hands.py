@@ -36,7 +36,7 @@ LARGEST_NOD = 0.45
 """Largest nod of who does not bend [rad]."""
 LARGEST_BEND = 0.65
 """Largest bend of the trunk [rad]."""
-LOW_REACH = 0.9
+LOW_REACH = 0.85
 """Share of the arm's length that hands use for what is that low."""
 KNEES = 0.1
 """How much farther out hands work for each metre of squatting [m/m]."""
@@ -60,23 +60,28 @@ def compute_reach_time(mind: Mind, distance: float) -> float:
     return float(max(fitts, distance / person.hand_speed, 0.25))
 
 
-def plan_posture(mind: Mind, points: list[np.ndarray]) -> Posture:
+def plan_posture(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> Posture:
     """How to hold the body so that points of the robot's world are at a good height.
 
     Within a comfortable range below the eyes a person stands upright; for what is lower the
     person squats, and nods to see it; for what is lower than that, bends, too.
+
+    Args:
+        mind: Who plans.
+        points: What hands work at. Shapes (3,).
+        farther: How much farther than for a touch they are to be; above 0 for a grasp [m].
     """
-    look = np.array([0.0, compute_nod(mind, points)])
-    drop, bend = compute_drop(mind, points), compute_bend(mind, points)
+    look = np.array([0.0, compute_nod(mind, points, farther)])
+    drop, bend = compute_drop(mind, points), compute_bend(mind, points, farther)
     return replace(mind.body.posture, drop=drop, lean=np.zeros(2), look=look, bend=bend)
 
 
-def compute_nod(mind: Mind, points: list[np.ndarray]) -> float:
+def compute_nod(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
     """Nod with which points are well in view, from where they are worked at best [rad]."""
-    bend = compute_bend(mind, points)
-    eyes = compute_eyes(mind, points)
+    bend = compute_bend(mind, points, farther)
+    eyes = compute_eyes(mind, points, farther)
     lowest = eyes - mind.belief.height_to_own(float(min(point[2] for point in points)))
-    ahead = compute_reach(mind) - compute_draw(mind, points)
+    ahead = compute_reach(mind) - compute_draw(mind, points, farther)
     angle = np.arctan2(mind.belief.scale * lowest, ahead)
     nod = angle - mind.person.view_half_angles[1] + MARGIN
     return float(np.clip(nod, bend, max(LARGEST_NOD, bend)))
@@ -87,39 +92,46 @@ def compute_drop(mind: Mind, points: list[np.ndarray]) -> float:
     return float(np.clip(_compute_lack(mind, points), 0.0, mind.person.leg_bend))
 
 
-def compute_bend(mind: Mind, points: list[np.ndarray]) -> float:
+def compute_bend(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
     """How far a person bends the trunk for points that are too low for a squat [rad].
 
-    The trunk makes up for half of what the knees leave, the arms, which hang, for the rest.
+    As far as it goes for a grasp (`farther` > 0): the knees must stay clear of what things stand
+    on, and the arms bent.
     """
     lack = _compute_lack(mind, points) - mind.person.leg_bend
-    if lack <= 0:
-        return 0.0
-    return min(float(np.arccos(1 - min(lack / 2 / (TRUNK * mind.person.size), 1))), LARGEST_BEND)
+    if lack <= 0 or farther:
+        return LARGEST_BEND if lack > 0 else 0.0
+    return min(float(np.arccos(1 - min(lack / (TRUNK * mind.person.size), 1))), LARGEST_BEND)
 
 
-def compute_eyes(mind: Mind, points: list[np.ndarray]) -> float:
+def compute_eyes(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
     """Height of the eyes of who squats and bends for points of the robot's world [m, own]."""
     eyes = mind.person.eye_height
-    return eyes - compute_drop(mind, points) - compute_sinking(compute_bend(mind, points), eyes)
+    sunk = compute_sinking(compute_bend(mind, points, farther), eyes)
+    return eyes - compute_drop(mind, points) - sunk
 
 
-def compute_draw(mind: Mind, points: list[np.ndarray]) -> float:
+def compute_draw(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
     """By how much nearer to the eyes than usual who bends has the hands [m, robot].
 
     A trunk that bends brings the eyes ahead of the shoulders, and arms that reach down do not
     reach as far ahead.
+
+    Args:
+        mind: Who bends.
+        points: What hands work at. Shapes (3,).
+        farther: How much farther than for a touch they usually are [m].
     """
-    bend, size = compute_bend(mind, points), mind.person.size
+    bend, size = compute_bend(mind, points, farther), mind.person.size
     if not bend:
         return 0.0
     ahead, up = _turn_down(SHOULDER[0], SHOULDER[2], bend)
     point = mind.belief.height_to_own(float(np.mean(points, axis=0)[2]))
-    depth = compute_eyes(mind, points) + size * up - point
+    depth = compute_eyes(mind, points, farther) + size * up - point
     length = LOW_REACH * size * (sum(ARM) + HAND)
     farthest = size * ahead + float(np.sqrt(max(length**2 - depth**2, 0.0)))
     usual = compute_reach(mind) + mind.belief.scale * KNEES * compute_drop(mind, points)
-    return max(usual - mind.belief.scale * farthest, 0.0)
+    return max(usual + farther - mind.belief.scale * farthest, 0.0)
 
 
 def _compute_lack(mind: Mind, points: list[np.ndarray]) -> float:
@@ -144,15 +156,20 @@ def compute_reach(mind: Mind) -> float:
     return (mind.belief.scale * own + mind.eyes.rest_reach) / 2
 
 
-def compute_distance(mind: Mind, points: list[np.ndarray]) -> float:
+def compute_distance(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
     """From where to stand upright to what hands shall work at, in the robot's world [m].
 
     Who nods brings the eyes forward; who squats has the knees ahead, and works farther out.
+
+    Args:
+        mind: Who stands.
+        points: What hands work at. Shapes (3,).
+        farther: How much farther than for a touch they are to be [m].
     """
     knees = mind.belief.scale * KNEES * compute_drop(mind, points)
-    nod, bend = compute_nod(mind, points), compute_bend(mind, points)
+    nod, bend = compute_nod(mind, points, farther), compute_bend(mind, points, farther)
     eyes = NECK * float(np.sin(nod)) - HIPS_BACK * float(np.sin(bend))
-    return compute_reach(mind) - compute_draw(mind, points) + knees + eyes
+    return compute_reach(mind) - compute_draw(mind, points, farther) + knees + eyes + farther
 
 
 def is_stretched(mind: Mind, side: str, point: np.ndarray) -> bool:
@@ -193,7 +210,7 @@ def go_down(mind: Mind, posture: Posture, way: float) -> Posture:
     eye_height = mind.person.eye_height
     trunk = TRUNK * mind.person.size
     sunk = compute_sinking(posture.bend, eye_height)
-    bend = float(np.arccos(1 - min((sunk + way / 2) / trunk, 1)))
+    bend = float(np.arccos(1 - min((sunk + way) / trunk, 1)))
     bend = max(min(bend, LARGEST_BEND), posture.bend)
     room = mind.body.compute_hands_in_room(posture)
     room[:, 2] -= way

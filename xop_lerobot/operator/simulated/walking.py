@@ -55,6 +55,7 @@ def find(mind: Mind, *names: str) -> Doing:
         mind.note("look to both sides")
         yield from glance(mind, *names)
     if _knows(mind, names):
+        yield from _look_up(mind)
         return
     mind.note("turn round to look")
     yield from set_mode(mind, Mode.MOBILE)
@@ -64,6 +65,7 @@ def find(mind: Mind, *names: str) -> Doing:
     yield from _search(mind, names)
     if not _knows(mind, names):
         raise GaveUp(f"did not find {', '.join(names)}")
+    yield from _look_up(mind)
 
 
 def look_down(mind: Mind, names: tuple[str, ...]) -> Doing:
@@ -75,6 +77,14 @@ def look_down(mind: Mind, names: tuple[str, ...]) -> Doing:
     last = mind.body.posture
     mind.body.move(replace(last, look=np.array([last.look[0], LOOK_DOWN])), LOOK_DOWN_S)
     yield from _search(mind, names)
+
+
+def _look_up(mind: Mind) -> Doing:
+    """Look ahead again, to stand where one seems to; a nod brings the head forward."""
+    last = mind.body.posture
+    if last.look[1]:
+        mind.body.move(replace(last, look=np.array([last.look[0], 0.0])), LOOK_DOWN_S)
+        yield from mind.settle("head")
 
 
 def glance(mind: Mind, *names: str) -> Doing:
