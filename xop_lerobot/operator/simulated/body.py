@@ -41,8 +41,8 @@ BOB = (0.010, 0.012)
 """Amplitude of the head up and down, and sideways, at 0.6 m/s [m]."""
 NECK = 0.45
 """How far the eyes go forward with a nod, of trunk and neck in equal parts [m/rad]."""
-TRUNK = 0.70
-"""From the hips to the eyes [m], for eyes at 1.6 m."""
+TRUNK = 0.50
+"""Over what length a bend of the trunk lowers the eyes [m], for eyes at 1.6 m."""
 HIPS_BACK = 0.20
 """How far the hips go back under a trunk that bends, to keep the balance [m/rad]."""
 

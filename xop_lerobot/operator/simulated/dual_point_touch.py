@@ -30,7 +30,7 @@ APPROACHES = 6
 SHIFT = 0.07
 """How much closer a person stands at the next approach, or farther, if arms were bent [m]."""
 LEAN_AFTER = 2
-"""Number of corrections in vain after which the person leans."""
+"""Number of corrections in vain after which the person leans, unless bent."""
 
 
 def touch_two_points(mind: Mind) -> Doing:
@@ -126,7 +126,7 @@ def hold_points(mind: Mind) -> Doing:
         worst_ever = min(worst, worst_ever)
         if wasted >= mind.person.corrections:
             return
-        if wasted == LEAN_AFTER:
+        if wasted == LEAN_AFTER and not mind.body.posture.bend:
             yield from lean(mind, errors)
             continue
         far = {
