@@ -129,7 +129,10 @@ def compute_draw(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> 
     ahead, up = _turn_down(SHOULDER[0], SHOULDER[2], bend)
     point = mind.belief.height_to_own(float(np.mean(points, axis=0)[2]))
     depth = compute_eyes(mind, points, farther) + size * up - point
-    length = (LOW_GRASP if farther else LOW_REACH) * size * (sum(ARM) + HAND)
+    share = LOW_GRASP if farther else LOW_REACH
+    # A robot that rests its hands farther ahead than people hold theirs has longer arms.
+    longer = mind.eyes.rest_reach / (mind.belief.scale * mind.person.reach * size)
+    length = share * size * (sum(ARM) + HAND) * max(longer, 1.0)
     farthest = size * ahead + float(np.sqrt(max(length**2 - depth**2, 0.0)))
     usual = compute_reach(mind) + mind.belief.scale * KNEES * compute_drop(mind, points)
     return max(usual + farther - mind.belief.scale * farthest, 0.0)
