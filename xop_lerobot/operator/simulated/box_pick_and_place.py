@@ -50,7 +50,7 @@ APART = 0.12
 too, as far as the robot's arms allow, not to sweep it off its support in a turn."""
 STAND_NEAR = 0.04
 """How far beside where it wants to stand before the box is good enough [m]."""
-BEND_NEAR = 0.06
+BEND_NEAR = 0.05
 """How much too far a box may be for who bends [m]."""
 GRASPS = 4
 """How often a person takes hold anew before giving up."""

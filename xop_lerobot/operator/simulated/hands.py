@@ -36,9 +36,8 @@ LARGEST_NOD = 0.45
 """Largest nod of who does not bend [rad]."""
 LARGEST_BEND = 0.60
 """Largest bend of the trunk [rad]."""
-LOW_REACH, LOW_GRASP = 0.85, 0.9
-"""Share of the arm's length that hands use for what is that low, and for a grasp: farther, to keep
-the knees clear of what it stands on."""
+LOW_REACH = 0.85
+"""Share of the arm's length that hands use for what is that low."""
 KNEES = 0.1
 """How much farther out hands work for each metre of squatting [m/m]."""
 STRETCHED = 0.8
@@ -129,10 +128,9 @@ def compute_draw(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> 
     ahead, up = _turn_down(SHOULDER[0], SHOULDER[2], bend)
     point = mind.belief.height_to_own(float(np.mean(points, axis=0)[2]))
     depth = compute_eyes(mind, points, farther) + size * up - point
-    share = LOW_GRASP if farther else LOW_REACH
     # A robot that rests its hands farther ahead than people hold theirs has longer arms.
     longer = mind.eyes.rest_reach / (mind.belief.scale * mind.person.reach * size)
-    length = share * size * (sum(ARM) + HAND) * max(longer, 1.0)
+    length = LOW_REACH * size * (sum(ARM) + HAND) * max(longer, 1.0)
     farthest = size * ahead + float(np.sqrt(max(length**2 - depth**2, 0.0)))
     usual = compute_reach(mind) + mind.belief.scale * KNEES * compute_drop(mind, points)
     return max(usual + farther - mind.belief.scale * farthest, 0.0)
