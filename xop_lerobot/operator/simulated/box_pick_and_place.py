@@ -69,8 +69,9 @@ PLACE_NEAR = 0.04
 OPENINGS, DONE_S = 3, 2.5
 """How often a person takes the hands farther off a box, and how long they look whether it counts
 [s]."""
-OVER = 0.015
-"""Height of a box over the table from which one carries it there [m]."""
+OVER, WELL_OVER = 0.015, 0.06
+"""Height of a box over the table from which one carries it there, and to which one brings it in
+standing up with it [m]."""
 LOWERINGS, BY_KNEES, KNEES_SPEED = 6, 0.03, 0.08
 """How often a person lowers a box before letting it go anyway, from what height on it bends the
 knees for it [m], and how fast [m/s]."""
@@ -208,12 +209,18 @@ def straighten_up(mind: Mind) -> Doing:
 def bring_up(mind: Mind, hands: np.ndarray) -> np.ndarray:
     """Hands that would hang far down, once one stands, at a good height and distance instead.
 
+    A good height is well over the table, if that was seen.
+
     Args:
         mind: Who stands up.
         hands: Wrists, from the head along the body's heading. Shape (2, 7).
     """
     ahead = (compute_reach(mind) + FARTHER) / mind.belief.scale - HAND
-    good = np.array([ahead, 0.0, -mind.person.reach_low * mind.person.size])
+    height = -mind.person.reach_low * mind.person.size
+    if mind.eyes.knows("spot"):
+        middle = float(mind.eyes.pose("spot")[2] + mind.eyes.size("box")[2]) + WELL_OVER
+        height = max(height, mind.belief.height_to_own(middle) - mind.person.eye_height)
+    good = np.array([ahead, 0.0, height])
     way = good - hands[:, :3].mean(axis=0)
     raised = hands.copy()
     raised[:, :3] += np.array([min(way[0], 0.0), 0.0, max(way[2], 0.0)])
