@@ -279,10 +279,11 @@ def _write_mpc(figures: Mapping[str, list[Mapping[str, Any]]]) -> dict[str, str]
         key = next(
             key for key in ("after_p95_cm", "moving_mean_cm", "p95_cm") if key in runs[0]["metrics"]
         )
-        values = [run["metrics"][key] for run in runs]
+        values = [run["metrics"][key] for run in runs if run["metrics"][key] is not None]
         falls = sum(bool(run["metrics"]["falls"]) for run in runs)
         told = f" ({falls})" if falls else ""
-        cells[scenario] = f"{np.median(values):.1f} / {max(values):.1f}{told}"
+        figures_told = f"{np.median(values):.1f} / {max(values):.1f}" if values else "lost"
+        cells[scenario] = figures_told + told
     return cells
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from low_level_teacher import ACTIONS, ARMS, JOINTS, Teacher
+from low_level_teacher import ACTIONS, ARMS, GRAVITY, JOINTS, Teacher
 from torch import nn
 
 from xop_lerobot.command import Mode
@@ -70,6 +70,9 @@ STANDING, MOVING = (LOW, WIDE), (WIDE, USUAL)
 
 SWAY = (0.15, 0.1)
 """Largest velocities, forward and left, by which a standing robot is told to sway [m/s]."""
+
+PAYLOAD, PAYLOAD_SHARE = 2.5, 0.4
+"""Largest mass in a hand [kg], and share of the robots that carry something."""
 
 FORCE_LAG_S = 0.2
 """Time in which forces on the hands grow [s]."""
@@ -208,6 +211,9 @@ class Collector:
         self.teacher, self.rng, self.robots = teacher, rng, robots
         morphology = make_morphology("g1")
         models = [randomise(build_model(morphology, "planning"), rng) for _ in range(robots)]
+        self.weight = np.zeros((robots, 2, 3))  # of what hands carry, which the teacher knows [N]
+        for model, weight in zip(models, self.weight, strict=True):
+            weight[:, 2] = -GRAVITY * load_hands(model, rng)
         self.simulation = BatchSimulation(models, morphology.standing_qpos(), threads)
         self.student = load_policy("default")  # its table says what is remembered and seen
         self.memory = self.student.initial_memory(robots)
@@ -238,7 +244,7 @@ class Collector:
             mode = random.mode[self.step]
             taught = self.teacher.teach(
                 (simulation.qpos, simulation.qvel), sensed, command, arms, self.taught_memory,
-                mode, force, self.share,
+                mode, force + self.weight, self.share,
             )  # fmt: skip
             inputs = (*sensed, command, arms, self.memory, mode)
             experience.add(self.student.observe(*inputs), taught.actions)
@@ -300,6 +306,24 @@ def make_training_excitation(rng: np.random.Generator, robots: int) -> Excitatio
         sway = largest * size[axis] * np.sin(phase[:, axis])
         drawn.command[..., VELOCITIES.start + axis] += np.where(stands, sway, 0.0)
     return drawn
+
+
+def load_hands(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
+    """Put something into the hands of some robots, into both the same or into each its own.
+
+    Returns:
+        Masses in the left and the right hand [kg]. Shape (2,).
+    """
+    carries, alike = rng.uniform(size=2) < (PAYLOAD_SHARE, 0.5)
+    masses = carries * rng.uniform(0, PAYLOAD, 2)
+    if alike:
+        masses[1] = masses[0]
+    for side, mass in zip(("left", "right"), masses, strict=True):
+        hand = model.body(f"{side}_wrist_yaw_link").id
+        model.body_inertia[hand] *= 1 + mass / model.body_mass[hand]
+        model.body_mass[hand] += mass
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return masses
 
 
 def randomise(model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjModel:

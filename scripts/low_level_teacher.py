@@ -230,6 +230,7 @@ class Balance:
         at_rest = (at_rest + (push[..., :2] * hands[..., 2:]).sum(1)) / load[:, None]
         omega = np.sqrt(GRAVITY / np.maximum(com[:, 2], 0.3))[:, None]
         aim = np.clip(sway, -MAX_SWAY, MAX_SWAY)
+        aim[:, 0] = np.maximum(aim[:, 0], -MAX_SWAY[0] * compute_back_share(height))
         aim[:, 0] += compute_heel_shift(height)
         capture = at_rest + velocity[:, :2] / omega
 
@@ -264,6 +265,11 @@ class Balance:
         targets = qpos[:, 7:19] + tau / body.stiffness[LEGS]
         pitch = -np.arcsin(np.clip(pelvis[:, 2, 0], -1, 1))
         return Balanced(targets, capture, capture - aim, half_width, soles, tilt, pitch)
+
+
+def compute_back_share(height: np.ndarray) -> np.ndarray:
+    """How much of the sway backwards there is room for: low, the heels are near."""
+    return np.clip((height - 0.5) / 0.2, 0, 1)
 
 
 def compute_heel_shift(height: np.ndarray) -> np.ndarray:

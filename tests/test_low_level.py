@@ -23,7 +23,7 @@ from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
 from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput, make_policy
 from xop_lerobot.low_level.tables import find_table, load_policy, read_table
-from xop_lerobot.low_level.trial import run_trials
+from xop_lerobot.low_level.trial import BatchSimulation, run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.transforms import (
@@ -244,6 +244,37 @@ def test_g1_stands_and_walks(name: str) -> None:
     assert np.linalg.norm(position[0, :2]) < 0.15
     assert abs(position[0, 2] - 0.75) < 0.03
     assert 1.2 < position[1, 0] < 2.4
+    simulation.close()
+
+
+def test_g1_bears_a_load() -> None:
+    """2 kg in each hand, stretched ahead in 0.4 s: it stands, high and low, and stays."""
+    morphology = make_morphology("g1")
+    model = build_model(morphology, "planning")
+    for side in ("left", "right"):
+        hand = model.body(f"{side}_wrist_yaw_link").id
+        model.body_inertia[hand] *= 1 + 2.0 / model.body_mass[hand]
+        model.body_mass[hand] += 2.0
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    heights = np.array([0.75, 0.75, 0.65, 0.55, 0.45])
+    n, policy = len(heights), make_policy("default")
+    simulation = BatchSimulation([model] * n, morphology.standing_qpos(), threads=1)
+    rest, memory = morphology.rest_action().arms, policy.initial_memory(n)
+    ahead = rest.copy()
+    for side in ("left", "right"):
+        ahead[morphology.arm_names.index(f"{side}_shoulder_pitch_joint")] = -1.4
+        ahead[morphology.arm_names.index(f"{side}_elbow_joint")] = 1.3
+    command, start = np.tile(STAND, (n, 1)), simulation.qpos[:, :2].copy()
+    for step in range(400):
+        command[:, 0] = np.maximum(heights, 0.75 - 0.005 * step)
+        share = np.clip((step - 100) / 20, 0, 1)
+        arms = np.tile(rest + share * (ahead - rest), (n, 1))
+        targets, memory = policy.act(
+            simulation.qpos, simulation.qvel, command, arms, memory, Mode.STATIONARY
+        )
+        simulation.step(targets)
+        assert not simulation.fallen().any()
+    assert np.linalg.norm(simulation.qpos[:, :2] - start, axis=1).max() < 0.2  # noqa: PLR2004
     simulation.close()
 
 
