@@ -123,12 +123,11 @@ def make_loop(robot: str, seed: int = 0) -> PolicyLoop:
 @pytest.mark.parametrize("robot", ["g1", "rby1"])
 def test_the_predicted_state_is_the_one_that_comes(robot):
     """With the planning model as the plant: position, velocity, memory, command and clock."""
-    loop, morphology = make_loop(robot), make_morphology(robot)
+    loop, policy = make_loop(robot), make_policy(POLICIES[robot])
+    morphology = make_morphology(robot).fit(policy)
     space = morphology.command_space
     model = build_model(morphology, "planning")
-    predictor = StatePredictor(
-        morphology, PolicyRollout(model, make_policy(POLICIES[robot]), num_threads=1)
-    )
+    predictor = StatePredictor(morphology, PolicyRollout(model, policy, num_threads=1))
     rng = np.random.default_rng(3)
     commands = space.neutral + 0.2 * rng.uniform(-1, 1, (8, len(space))) * (space.high - space.low)
     commands = np.clip(commands, space.low, space.high)

@@ -12,7 +12,13 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.state import Goal
-from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_from_yaw, quat_multiply
+from xop_lerobot.transforms import (
+    make_pose,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+)
 
 
 @pytest.fixture(scope="module", params=["g1", "rby1"])
@@ -43,12 +49,13 @@ def turned(robot, yaw):
 @pytest.mark.parametrize("yaw", [0.0, 0.8, 2.5])
 def test_who_walks_ahead_makes_the_robot_walk_ahead(robot, yaw):
     """Also where the robot has drifted and looks elsewhere than the person."""
-    velocity = (0.4 * np.cos(yaw), 0.4 * np.sin(yaw), 0, 0, 0, 0.1)
-    command = plan(robot, turned(robot, yaw), velocity)
+    ahead = turned(robot, yaw)
+    velocity = (*quat_rotate(ahead[3:], np.array([0.4, 0, 0]))[:2], 0, 0, 0, 0.1)
+    command = plan(robot, ahead, velocity)
     assert command["vx" if "vx" in command else "v"] == pytest.approx(0.4, abs=0.02)
     assert command.get("vy", 0.0) == pytest.approx(0, abs=0.02)
     assert command["yaw_rate"] == pytest.approx(0.1)
-    standing = plan(robot, turned(robot, yaw), velocity, Mode.STATIONARY)
+    standing = plan(robot, ahead, velocity, Mode.STATIONARY)
     assert standing["yaw_rate"] == 0
 
 

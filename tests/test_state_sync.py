@@ -154,7 +154,7 @@ def test_a_predicted_velocity_that_is_far_off_is_no_news(bad):
 
 def test_the_height_of_a_walking_robot_outlasts_the_foot_that_told_it():
     errors = []
-    for seed in range(2):
+    for seed in range(4):
         states = record("g1", "mild", seed, Mode.MOBILE, vx=0.4)
         sync = make_sync(make_robot("g1"))
         synced = synchronise_all(sync, states, Mode.MOBILE, [None] * len(states))
