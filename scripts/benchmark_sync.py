@@ -144,7 +144,7 @@ def _make_action(morphology: Morphology, case: Case, time_s: float) -> RobotActi
     for name, value in case.command.items():
         index = space.names.index(name)
         moves = bool(space.mobile_only[index])
-        action.command[index] += value if moves or time_s % 4 < 2 else 0.0  # noqa: PLR2004
+        action.command[index] += value if moves or time_s % 4 < 2 else 0.0
     return RobotAction(action.command, case.mode, action.arms)
 
 

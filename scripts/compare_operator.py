@@ -53,10 +53,10 @@ def print_table(motions: list[Motion]) -> None:
 
 def plot(motions: list[Motion], path: Path) -> None:
     """Speeds over time, their distributions, and the spectrum of the head."""
-    import matplotlib as mpl  # noqa: PLC0415
+    import matplotlib as mpl
 
     mpl.use("Agg")
-    import matplotlib.pyplot as plt  # noqa: PLC0415
+    import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 2, figsize=(12, 8))
     for motion in motions:

@@ -145,10 +145,10 @@ def show(demos: list[Demo], roots: list[Path], out: Path) -> None:
     """Load the datasets back, write the pictures and print the table."""
     # Loading LeRobot takes seconds, so it waits until the recordings are there.
     os.environ.update(build_environment(out, os.environ))
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from xop_lerobot.evaluation import strip, summary  # noqa: PLC0415
-    from xop_lerobot.morphology.morphology import make_morphology  # noqa: PLC0415
+    from xop_lerobot.evaluation import strip, summary
+    from xop_lerobot.morphology.morphology import make_morphology
 
     summaries = []
     for demo, root in zip(demos, roots, strict=True):

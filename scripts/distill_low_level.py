@@ -105,7 +105,7 @@ class Network(LoadedNetwork):
     def __init__(self, hidden: tuple[int, ...], observations: torch.Tensor) -> None:
         self.mean = observations.mean(0)
         spread = observations.std(0)
-        self.spread = torch.where(spread < 1e-4, torch.ones_like(spread), spread.clamp(min=0.02))  # noqa: PLR2004
+        self.spread = torch.where(spread < 1e-4, torch.ones_like(spread), spread.clamp(min=0.02))
         sizes = (observations.shape[1], *hidden, len(JOINTS.names))
         self.num_inputs, self.num_outputs = sizes[0], sizes[-1]
         layers: list[nn.Module] = []
@@ -219,8 +219,8 @@ class Collector:
         self.memory = self.student.initial_memory(robots)
         self.taught_memory, self.share = teacher.initial_memory(robots), np.zeros(robots)
         # Arms that push against something, or each other, are not where they are told to be.
-        self.hindered = rng.uniform(size=(robots, 1)) < 0.15  # noqa: PLR2004
-        self.noise = rng.uniform(0, 1, (robots, 1)) * (rng.uniform(size=(robots, 1)) < 0.6)  # noqa: PLR2004
+        self.hindered = rng.uniform(size=(robots, 1)) < 0.15
+        self.noise = rng.uniform(0, 1, (robots, 1)) * (rng.uniform(size=(robots, 1)) < 0.6)
         self.excitation: Excitation | None = None
         self.step = 0
         self.falls = 0
@@ -301,7 +301,7 @@ def make_training_excitation(rng: np.random.Generator, robots: int) -> Excitatio
     phase = rng.uniform(0, 2 * np.pi, (2, robots)) + np.arange(EPISODE_STEPS)[:, None, None] * (
         POLICY_DT * rng.uniform(0.2, 1.5, (2, robots))
     )
-    size = rng.uniform(0, 1, (2, robots)) * (rng.uniform(size=robots) < 0.4)  # noqa: PLR2004
+    size = rng.uniform(0, 1, (2, robots)) * (rng.uniform(size=robots) < 0.4)
     for axis, largest in enumerate(SWAY):
         sway = largest * size[axis] * np.sin(phase[:, axis])
         drawn.command[..., VELOCITIES.start + axis] += np.where(stands, sway, 0.0)
@@ -328,7 +328,7 @@ def load_hands(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
 
 def randomise(model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjModel:
     """Vary friction, masses and gains of a model in place; a quarter have dry friction."""
-    model.dof_frictionloss[6:] = 0.2 if rng.uniform() < 0.25 else 0.0  # noqa: PLR2004
+    model.dof_frictionloss[6:] = 0.2 if rng.uniform() < 0.25 else 0.0
     model.geom_friction[:, 0] = rng.uniform(0.5, 1.2)
     scale = rng.uniform(0.95, 1.05, (model.nbody, 1))
     model.body_mass *= scale[:, 0]
@@ -339,7 +339,7 @@ def randomise(model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjModel
     return model
 
 
-def train(  # noqa: PLR0913
+def train(
     network: Network,
     experience: Experience,
     updates: int,

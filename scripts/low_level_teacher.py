@@ -486,7 +486,7 @@ class Teacher:
         """FALCON's. Shape (n, nm)."""
         return self.falcon.initial_memory(n)
 
-    def teach(  # noqa: PLR0913
+    def teach(
         self,
         true: tuple[np.ndarray, np.ndarray],
         sensed: tuple[np.ndarray, np.ndarray],

@@ -78,7 +78,7 @@ def count(frames: Iterator[OperatorFrame]) -> tuple[float, int, Counter[str]]:
     pinches, closed, engaged = 0, np.zeros(2, dtype=bool), False
     for frame in frames:
         first, last = frame.time if first is None else first, frame.time
-        now = frame.pinch < 0.018  # noqa: PLR2004
+        now = frame.pinch < 0.018
         pinches += int((now & ~closed).sum())
         closed = now
         asked = hands.read(frame)
@@ -96,7 +96,7 @@ def load(path: Path) -> list[Recording]:
     """Load a recording, or every episode of a dataset."""
     if not is_dataset(path):
         return [load_recording(path)]
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # noqa: PLC0415
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     number = LeRobotDatasetMetadata("local/data", root=path).total_episodes
     return [load_dataset_recording(path, episode) for episode in range(number)]

@@ -75,7 +75,7 @@ class Grasp:
         furniture.place(plant, "support", top, NO_TURN)
         plant.set_object_pose("box", make_pose(self.middle, NO_TURN))
         plant.rearrange()
-        task._rest = self.middle[2]  # noqa: SLF001
+        task._rest = self.middle[2]
 
     def _step(self) -> None:
         state = self.loop.state
@@ -92,7 +92,7 @@ class Grasp:
         plant, task = self.stage.plant, self.stage.task
         self.log.box.append(plant.get_object_pose("box"))
         self.log.speed.append(self.stage.status.figures["speed_m_s"])
-        self.log.touched.append(task._touching.find())  # noqa: SLF001
+        self.log.touched.append(task._touching.find())
         self.log.effort.append(plant.data.actuator_force.copy())
 
     def move(self, gap: float, lift: float, seconds: float) -> None:

@@ -292,7 +292,7 @@ def test_changes_from_many_threads_arrive_whole(rig):  # noqa: F811
                 value = float(rng.uniform(0.5, 2))
                 r.teleop.change({"weights": {"position": value, "terminal": value}})
                 stop.wait(0.001)
-        except Exception as failure:  # noqa: BLE001
+        except Exception as failure:
             failures.append(failure)
 
     threads = [threading.Thread(target=disturb, args=(i,)) for i in range(3)]

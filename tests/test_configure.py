@@ -301,7 +301,7 @@ def test_changes_from_another_thread_arrive_whole(threads):
                 turn = 1 - turn
                 retargeter.configure(configs[turn], *kinds[turn][1:])
                 stop.wait(0.0007)  # else who holds the lock decides what is seen
-        except Exception as error:  # noqa: BLE001  it is raised below
+        except Exception as error:  # it is raised below
             errors.append(error)
 
     changer = threading.Thread(target=change)

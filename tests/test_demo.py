@@ -33,7 +33,7 @@ def test_each_demo_is_a_stock_recording(demo: ModuleType, tmp_path: Path) -> Non
 
 
 def test_the_scripts_fit_in_their_episodes(demo: ModuleType) -> None:
-    import yaml  # noqa: PLC0415
+    import yaml
 
     folder = ROOT / "xop_lerobot" / "operator" / "scripts"
     for show in demo.DEMOS.values():

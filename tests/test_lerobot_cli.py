@@ -16,7 +16,7 @@ from pathlib import Path
 import draccus
 import numpy as np
 import pytest
-import toy_robot  # noqa: F401  registers the toy
+import toy_robot  # registers the toy
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts.lerobot_record import RecordConfig
 from lerobot.utils.keyboard_input import apply_recording_control

@@ -274,7 +274,7 @@ def test_g1_bears_a_load() -> None:
         )
         simulation.step(targets)
         assert not simulation.fallen().any()
-    assert np.linalg.norm(simulation.qpos[:, :2] - start, axis=1).max() < 0.2  # noqa: PLR2004
+    assert np.linalg.norm(simulation.qpos[:, :2] - start, axis=1).max() < 0.2
     simulation.close()
 
 
@@ -295,7 +295,7 @@ def test_g1_stops_in_any_phase_of_its_gait() -> None:
             wanted = STAND + np.array([0, 0, 0, 0, 0.0 if step >= stop[i] else 1.0, 0, 0])
             stops = space.stop_rate if step >= stop[i] else space.max_rate
             command[i] += np.clip(wanted - command[i], -stops * 0.02, stops * 0.02)
-            if step >= stop[i] and command[i, 4] < 1e-9:  # noqa: PLR2004
+            if step >= stop[i] and command[i, 4] < 1e-9:
                 mode[i] = Mode.STATIONARY
         targets, memory = policy.act(
             simulation.qpos, simulation.qvel, command, np.tile(arms, (n, 1)), memory, mode
@@ -304,7 +304,7 @@ def test_g1_stops_in_any_phase_of_its_gait() -> None:
         assert not simulation.fallen().any()
         places.append(simulation.qpos[:, 0].copy())
     back = np.max(places, axis=0) - places[-1]
-    assert back.max() < 0.2  # noqa: PLR2004
+    assert back.max() < 0.2
     simulation.close()
 
 
@@ -332,8 +332,8 @@ def test_g1_squats_and_leans() -> None:
     np.testing.assert_allclose(simulation.qpos[2, 19:22], [0.6, 0.15, 0.3], atol=0.12)
     pitch = quat_to_rpy(simulation.qpos[:, 3:7])[:, 1]
     np.testing.assert_allclose(pitch[[0, 2, 3]], [0, 0, 0.5], atol=0.12)
-    assert np.linalg.norm(simulation.qpos[:, :2], axis=1).max() < 0.2  # noqa: PLR2004
-    assert np.abs(simulation.qvel[:, :2]).max() < 0.02  # noqa: PLR2004
+    assert np.linalg.norm(simulation.qpos[:, :2], axis=1).max() < 0.2
+    assert np.abs(simulation.qvel[:, :2]).max() < 0.02
     simulation.close()
 
 
@@ -356,14 +356,14 @@ def test_g1_stands_with_arms_anywhere() -> None:
         )
         simulation.step(targets)
     assert not simulation.fallen().any()
-    assert np.linalg.norm(simulation.qpos[:, :2], axis=1).max() < 0.15  # noqa: PLR2004
+    assert np.linalg.norm(simulation.qpos[:, :2], axis=1).max() < 0.15
     simulation.close()
 
 
 def test_balance_stands_without_falcon(monkeypatch: pytest.MonkeyPatch) -> None:
     """The teacher's own balance: at its height, leaning, under forces, and dead still."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    from low_level_teacher import Balance  # noqa: PLC0415
+    from low_level_teacher import Balance
 
     n, balance = 4, Balance()
     rest = make_morphology("g1").rest_action().arms
@@ -386,15 +386,15 @@ def test_balance_stands_without_falcon(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(simulation.qpos[:, 2], height, atol=0.01)
     pitch = quat_to_rpy(simulation.qpos[:, 3:7])[:, 1]
     np.testing.assert_allclose(pitch[[0, 2, 3]], lean[[0, 2, 3]], atol=0.05)
-    assert np.abs(measured.soles - soles).max() < 0.02  # noqa: PLR2004
-    assert np.abs(simulation.qvel[:3]).max() < 0.01  # noqa: PLR2004  # unless pulled, dead still
+    assert np.abs(measured.soles - soles).max() < 0.02
+    assert np.abs(simulation.qvel[:3]).max() < 0.01  # unless pulled, dead still
     simulation.close()
 
 
 def test_teacher_steps_when_pushed_and_stands_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """A push out of the support is FALCON's; once the feet are still the balance acts again."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    from low_level_teacher import ACTIONS, Teacher  # noqa: PLC0415
+    from low_level_teacher import ACTIONS, Teacher
 
     teacher, simulation = Teacher(find_teacher()), make_simulation(2, threads=1)
     rest = np.tile(make_morphology("g1").rest_action().arms, (2, 1))
@@ -415,16 +415,16 @@ def test_teacher_steps_when_pushed_and_stands_again(monkeypatch: pytest.MonkeyPa
     assert np.min(shares[50:], axis=0)[0] == 0
     assert np.min(shares[50:], axis=0)[1] == 1
     np.testing.assert_array_equal(share, 1)
-    assert simulation.qpos[0, 0] > 0.15  # noqa: PLR2004
-    assert np.abs(simulation.qvel[:, :3]).max() < 0.01  # noqa: PLR2004
+    assert simulation.qpos[0, 0] > 0.15
+    assert np.abs(simulation.qvel[:, :3]).max() < 0.01
     simulation.close()
 
 
 def test_skip_is_folded_into_the_layers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A saved student does what the one in training did, and can be trained further."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    import torch  # noqa: PLC0415
-    from distill_low_level import Network  # noqa: PLC0415
+    import torch
+    from distill_low_level import Network
 
     torch.manual_seed(0)
     observations = torch.randn(50, 575) * torch.rand(575)
@@ -451,12 +451,12 @@ def test_trials_count_falls_and_errors() -> None:
     hard = ExcitationConfig(push=2.0, push_period=0.5)
     excitation = make_excitation(rng, 4, 200, hard)
     simulation = make_simulation(4, threads=1)
-    assert run_trials(load_policy("default", network=Says(0.0)), simulation, excitation).falls == 4  # noqa: PLR2004
+    assert run_trials(load_policy("default", network=Says(0.0)), simulation, excitation).falls == 4
     easy = make_excitation(rng, 4, 200, ExcitationConfig(push=0.0, arm_range=0.2))
     result = run_trials(make_policy("default"), simulation, easy)
     assert result.falls == 0
-    assert result.height_rmse < 0.05  # noqa: PLR2004
-    assert result.planar_rmse < 0.4  # noqa: PLR2004
+    assert result.height_rmse < 0.05
+    assert result.planar_rmse < 0.4
     simulation.close()
 
 
@@ -466,7 +466,7 @@ def test_excitation_is_reproducible_and_within_its_ranges() -> None:
     first, again = (make_excitation(np.random.default_rng(3), 5, 300, config) for _ in range(2))
     np.testing.assert_array_equal(first.command, again.command)
     np.testing.assert_array_equal(first.push, again.push)
-    assert first.command[..., 0].min() >= 0.5 and first.command[..., 0].max() <= 0.75  # noqa: PLR2004, PT018
+    assert first.command[..., 0].min() >= 0.5 and first.command[..., 0].max() <= 0.75
     assert np.abs(first.command[..., 1]).max() <= config.waist_yaw
     joints = read_joints("g1")
     assert (first.arms >= joints.low[15:]).all()
@@ -476,7 +476,7 @@ def test_excitation_is_reproducible_and_within_its_ranges() -> None:
 
 def test_shipped_weights_are_small() -> None:
     """At most 3 MB, float32."""
-    assert WEIGHTS.stat().st_size <= 3_000_000  # noqa: PLR2004
+    assert WEIGHTS.stat().st_size <= 3_000_000
     with np.load(WEIGHTS) as arrays:
         assert {arrays[key].dtype for key in arrays.files} == {np.dtype("float32")}
 
@@ -525,9 +525,9 @@ def test_weights_round_trip(tmp_path: Path) -> None:
 
 def write_onnx(file: Path, inputs: int) -> Path:
     """Write a one-layer network with a fixed batch of one."""
-    import onnx  # noqa: PLC0415
+    import onnx
 
-    from xop_lerobot.low_level.networks import build_mlp  # noqa: PLC0415
+    from xop_lerobot.low_level.networks import build_mlp
 
     model = build_mlp([np.zeros((inputs, 29), np.float32)], [np.zeros(29, np.float32)])
     for tensor in (*model.graph.input, *model.graph.output):
@@ -582,7 +582,7 @@ def test_downloaded_file_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     """A download of another checksum is refused and not kept."""
 
     class Answer:
-        headers: dict[str, str] = {"content-length": "5"}  # noqa: RUF012
+        headers: dict[str, str] = {"content-length": "5"}
 
         def raise_for_status(self) -> None: ...
 
@@ -697,10 +697,10 @@ def test_rby1_drives_as_commanded() -> None:
         data.ctrl[:] = targets[0]
         mujoco.mj_step(model, data, 4)
     body = quat_rotate(quat_conjugate(data.qpos[3:7]), data.qvel[:3])
-    assert abs(data.qvel[5] - 0.5) < 0.05  # noqa: PLR2004
-    assert abs(body[0] - 0.4) < 0.05  # noqa: PLR2004
+    assert abs(data.qvel[5] - 0.5) < 0.05
+    assert abs(body[0] - 0.4) < 0.05
     for name, target in zip(morphology.arm_names[:14], rest.arms, strict=False):
-        assert abs(data.joint(name).qpos[0] - target) < 0.03  # noqa: PLR2004
+        assert abs(data.joint(name).qpos[0] - target) < 0.03
 
 
 def test_diff_drive_maps_by_name_and_clips() -> None:

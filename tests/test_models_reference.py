@@ -173,7 +173,7 @@ class Urdf:
                 poses, axes = self._place(joint, poses, axes, angles)
         return {name: (*poses[name], axes[name]) for name in axes}
 
-    def _place(self, joint, poses: dict, axes: dict, angles: Mapping[str, float]) -> tuple:  # noqa: ANN001
+    def _place(self, joint, poses: dict, axes: dict, angles: Mapping[str, float]) -> tuple:
         parent, child = joint.find("parent").get("link"), joint.find("child").get("link")
         if parent not in poses or child in poses:
             return poses, axes

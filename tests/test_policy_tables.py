@@ -171,7 +171,7 @@ def test_batches_modes_and_purity(name: str, made_up: Path) -> None:
             )
             np.testing.assert_allclose(own[0], targets[row], atol=1e-5)
             np.testing.assert_allclose(alone[row][0], together[row], atol=1e-4)
-        if step == 3:  # noqa: PLR2004
+        if step == 3:
             modes = modes[::-1].copy()
 
 
@@ -186,7 +186,7 @@ def test_a_hand_over_never_steps_the_targets(name: str, made_up: Path) -> None:
         history.append(targets[0])
     steps = np.abs(np.diff(history, axis=0)).max(axis=1)
     for change in (20, 40):
-        assert steps[change - 1] < 1e-9  # noqa: PLR2004
+        assert steps[change - 1] < 1e-9
         assert steps[change : change + 10].max() > 0
 
 
@@ -277,8 +277,8 @@ def test_a_newcomer_adds_a_policy_by_one_file(tmp_path: Path) -> None:
     assert policy.arm_limits == dict.fromkeys(("left_elbow_joint", "right_elbow_joint"), (0.0, 1.5))
     model = make_morphology("g1").build_spec("planning").compile()
     policy.adapt(model)
-    assert model.actuator("left_knee_joint").gainprm[0] == 150  # noqa: PLR2004
-    assert model.actuator("left_hip_yaw_joint").gainprm[0] == 100  # noqa: PLR2004
+    assert model.actuator("left_knee_joint").gainprm[0] == 150
+    assert model.actuator("left_hip_yaw_joint").gainprm[0] == 100
     state = stack(make_states(1, seed=0))
     legs = policy.act(*state, policy.initial_memory(), WALK).targets[0, :12]
     qpos, _, command, _ = (each[0] for each in state)

@@ -50,7 +50,7 @@ def test_it_is_bilinear_and_stays_as_at_its_edge():
     first, second = rng.uniform(0.3, 0.9, (5, 40)), rng.uniform(-0.7, 0.6, (5, 40))
     clipped = np.stack([np.clip(first, 0.4, 0.8), np.clip(second, -0.5, 0.4)], axis=-1)
     got = rest(first, second)
-    for values, one in zip(rest._values, (got.pitch, got.forward), strict=True):  # noqa: SLF001
+    for values, one in zip(rest._values, (got.pitch, got.forward), strict=True):
         expected = RegularGridInterpolator((HEIGHTS, PITCHES), values)(clipped)
         np.testing.assert_allclose(one, expected, atol=1e-12)
 

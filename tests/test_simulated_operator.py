@@ -245,13 +245,13 @@ def test_gives_up_and_is_finished() -> None:
 
 
 def test_sets_out_to_do_every_task() -> None:
-    from xop_lerobot.tasks import (  # noqa: F401, PLC0415 they register themselves
+    from xop_lerobot.tasks import (  # noqa: F401 they register themselves
         box_pick_and_place,
         dual_point_reach,
         dual_point_touch,
         non_prehensile_transport,
     )
-    from xop_lerobot.tasks.task import TASKS  # noqa: PLC0415
+    from xop_lerobot.tasks.task import TASKS
 
     assert set(INTENTIONS) == set(TASKS) - {"wait"}  # which test_collect adds
 

@@ -578,7 +578,7 @@ def test_choice_of_opengl(
 def test_browser_view_follows_the_simulation(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from xop_lerobot.plant.viewer import BrowserViewer  # noqa: PLC0415 loads a web server
+    from xop_lerobot.plant.viewer import BrowserViewer  # loads a web server
 
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -612,7 +612,7 @@ def test_browser_view_follows_the_simulation(
 
 @pytest.mark.parametrize("robot", ["g1", "rby1"])
 def test_browser_meshes_are_as_large_as_the_geoms(robot: str) -> None:
-    from xop_lerobot.plant.viewer import build_body_meshes  # noqa: PLC0415 loads a web server
+    from xop_lerobot.plant.viewer import build_body_meshes  # loads a web server
 
     simulation = Simulation(make_morphology(robot))
     model = simulation.model
@@ -656,7 +656,7 @@ def test_the_documented_settings_are_the_real_ones() -> None:
 def test_a_display_that_does_not_answer_leads_to_the_browser_view(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from xop_lerobot.plant.viewer import BrowserViewer  # noqa: PLC0415 loads a web server
+    from xop_lerobot.plant.viewer import BrowserViewer  # loads a web server
 
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

@@ -303,7 +303,7 @@ def test_teleoperator_learns_of_obstacles():
     teleop.connect()
     robot.get_observation()
     teleop.get_action()
-    teleoperation = teleop._teleoperation  # noqa: SLF001
+    teleoperation = teleop._teleoperation
     told = []
     teleoperation.retargeter.set_obstacles = told.append
     get_session("stage_rby1").begin_episode(1)

@@ -149,7 +149,7 @@ def test_films_that_do_not_belong_together_are_refused() -> None:
         strip.build_strip({}, FPS)
 
 
-def make_dataset(root: Path, lengths: list[int]) -> Any:  # noqa: ANN401
+def make_dataset(root: Path, lengths: list[int]) -> Any:
     """Make what `read_camera` and `read_columns` take of a dataset: one film, many episodes."""
     key = "observation.images.head"
     film = root / "film.mp4"
@@ -210,7 +210,7 @@ def test_columns_of_a_real_dataset_are_read_by_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset  # noqa: PLC0415
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     features = {
         "action": {"dtype": "float32", "shape": (2,), "names": ["a", "b"]},

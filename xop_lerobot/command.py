@@ -376,7 +376,7 @@ class ActionLayout:
             flat[key] = number
         column = np.array(list(flat.values()))
         k = len(self.space)
-        mode = Mode.MOBILE if column[k] >= 0.5 else Mode.STATIONARY  # noqa: PLR2004
+        mode = Mode.MOBILE if column[k] >= 0.5 else Mode.STATIONARY
         return RobotAction(column[:k], mode, column[k + 1 :])
 
 

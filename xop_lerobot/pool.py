@@ -185,7 +185,7 @@ def do_job(function: Function, job: Any) -> tuple[Any, str]:
         return function(job), ""
     except XopError as error:
         return None, str(error)
-    except Exception as error:  # noqa: BLE001 whatever it is, the other jobs go on
+    except Exception as error:  # whatever it is, the other jobs go on
         return None, f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
 
 

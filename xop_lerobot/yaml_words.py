@@ -130,4 +130,4 @@ def load_yaml(text: str, *, switches: bool = False) -> Any:
     if switches:
         words = re.compile(r"^(?:on|off|yes|no)$", re.IGNORECASE)
         Loader.add_implicit_resolver("tag:yaml.org,2002:bool", words, list("oOyYnN"))
-    return yaml.load(text, Loader)  # noqa: S506 (it is a safe loader)
+    return yaml.load(text, Loader)  # it is a safe loader

@@ -168,7 +168,7 @@ def compute_config_hash(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def to_plain(value: Any) -> Any:  # noqa: ANN401  any configuration value
+def to_plain(value: Any) -> Any:  # any configuration value
     """Turn dataclasses, paths, enums and tuples into what JSON knows."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {

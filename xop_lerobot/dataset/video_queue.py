@@ -27,7 +27,7 @@ class VideoQueue:
         writer: LeRobot's `DatasetWriter`, whose `image_writer` there may be none of.
     """
 
-    def __init__(self, encoder: Any, writer: Any = None) -> None:  # noqa: ANN401  private types
+    def __init__(self, encoder: Any, writer: Any = None) -> None:  # private types
         self._encoder, self._writer = encoder, writer
         names = ("_frame_queues", "_threads", "_dropped_frames")
         self._readable = encoder is None or all(hasattr(encoder, name) for name in names)
@@ -63,7 +63,7 @@ class VideoQueue:
         return sum(self._encoder._dropped_frames.values())
 
 
-def _count(queue: Any) -> int:  # noqa: ANN401  of threads or of processes
+def _count(queue: Any) -> int:  # of threads or of processes
     try:
         return queue.qsize()
     except NotImplementedError:  # macOS does not count what waits for another process

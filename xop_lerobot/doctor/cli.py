@@ -48,7 +48,7 @@ def run_checks(setup: Setup, names: Sequence[str] = tuple(CHECKS)) -> Iterator[t
     for name in names:
         try:
             yield name, CHECKS[name](setup)
-        except Exception as error:  # noqa: BLE001  whatever it is, the other checks go on
+        except Exception as error:  # whatever it is, the other checks go on
             kind = "" if isinstance(error, XopError) else f"{type(error).__name__}: "
             yield name, Finding(Level.FAIL, f"{kind}{error}")
 

@@ -89,7 +89,7 @@ def _measure(device, seconds: float) -> Finding:  # noqa: ANN001  a LiveDevice, 
             "of which so few poses come engage nothing",
             figures,
         )
-    if rate < GOOD_HZ or (status.delay or 0) > SLOW_S or min(shares) < 0.9:  # noqa: PLR2004
+    if rate < GOOD_HZ or (status.delay or 0) > SLOW_S or min(shares) < 0.9:
         return Finding(
             Level.WARN,
             text,

@@ -86,7 +86,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
             raise BadValue(f"--{name} must be 0 or more, got {getattr(args, name)}")
     if args.time_limit is not None and not args.time_limit > 0:
         raise BadValue(f"--time-limit must be above 0 s, got {args.time_limit}")
-    if args.fps is not None and (args.fps < 1 or 50 % args.fps):  # noqa: PLR2004
+    if args.fps is not None and (args.fps < 1 or 50 % args.fps):
         raise BadValue(f"--fps must divide the low-level policy's 50 Hz, got {args.fps}")
     return args
 

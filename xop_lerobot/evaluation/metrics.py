@@ -69,7 +69,7 @@ def compute_balance_power(
     Raises:
         BadShape: If the shapes do not fit.
     """
-    if effort.ndim != 2 or velocity.shape != effort.shape:  # noqa: PLR2004
+    if effort.ndim != 2 or velocity.shape != effort.shape:
         raise BadShape("velocity", effort.shape, velocity.shape)
     _check_rows("standing", standing, len(effort))
     power = (effort * velocity)[np.asarray(standing, bool)]
@@ -106,7 +106,7 @@ def compute_jerk(
     """
     from scipy.signal import savgol_filter  # noqa: PLC0415 most of a second, for this one figure
 
-    if position.ndim != 2 or position.shape[1] != 3:  # noqa: PLR2004
+    if position.ndim != 2 or position.shape[1] != 3:
         raise BadShape("position", ("n", 3), position.shape)
     size = 2 * round(window_s / dt / 2) + 1
     if size <= JERK_ORDER:
@@ -184,7 +184,7 @@ def compute_roughness(command: np.ndarray, half_range: np.ndarray, dt: float) ->
     """
     if half_range.shape != command.shape[1:]:
         raise BadShape("half_range", command.shape[1:], half_range.shape)
-    if len(command) < 3:  # noqa: PLR2004
+    if len(command) < 3:
         return NEVER
     bends = np.diff(command, n=2, axis=0) / (dt * dt) / half_range
     return float(np.sqrt(np.square(bends).mean()))
@@ -204,7 +204,7 @@ def compute_slip(feet: np.ndarray, dt: float, height: float = 0.01) -> float:
     Returns:
         Speed, nan if no foot ever bears for two ticks.
     """
-    if feet.ndim != 3 or not feet.size:  # noqa: PLR2004
+    if feet.ndim != 3 or not feet.size:
         return NEVER
     low = feet[..., 2] < feet[..., 2].min(axis=0) + height
     bears = low[1:] & low[:-1]

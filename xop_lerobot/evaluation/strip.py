@@ -120,7 +120,7 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], fps: int, every: int = 3
     return len(pictures)
 
 
-def read_camera(dataset: Any, camera: str, episode: int = 0) -> np.ndarray:  # noqa: ANN401
+def read_camera(dataset: Any, camera: str, episode: int = 0) -> np.ndarray:
     """Decode all frames of a camera of one episode of a `LeRobotDataset`, in order.
 
     Args:
@@ -166,7 +166,7 @@ def check_cameras(cameras: Mapping[str, np.ndarray]) -> int:
         raise BadValue("there is no camera to show")
     count = len(next(iter(cameras.values())))
     for name, frames in cameras.items():
-        if frames.ndim != 4 or frames.shape[0] != count or frames.shape[3] != 3:  # noqa: PLR2004
+        if frames.ndim != 4 or frames.shape[0] != count or frames.shape[3] != 3:
             raise BadShape(f"camera '{name}'", (count, "height", "width", 3), frames.shape)
     return count
 

@@ -130,7 +130,7 @@ def compute_episode_summary(
     )
 
 
-def read_columns(dataset: Any, episode: int = 0) -> dict[str, np.ndarray]:  # noqa: ANN401
+def read_columns(dataset: Any, episode: int = 0) -> dict[str, np.ndarray]:
     """Read the one-dimensional columns of an episode of a `LeRobotDataset`.
 
     Args:

@@ -215,7 +215,7 @@ def measure_rest(policy: LowLevelPolicy, threads: int = 2) -> MeasuredRest:
         simulation.step(targets)
         up &= ~simulation.fallen()
         simulation.reset(~up)
-        if step >= 300 and step % 5 == 0:  # noqa: PLR2004
+        if step >= 300 and step % 5 == 0:
             gravity = compute_projected_gravity(simulation.qpos[:, 3:7])
             pitches.append(np.arcsin(np.clip(gravity[:, 0], -1, 1)))
             places.append([soles.compute_forward(qpos) for qpos in simulation.qpos])

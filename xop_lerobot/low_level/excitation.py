@@ -77,7 +77,7 @@ def make_excitation(
         steps: Policy steps of 20 ms.
         config: Ranges.
     """
-    mode = (_hold(rng, n, steps, (2.0, 7.0))[..., 0] < 0.5).astype(int)  # noqa: PLR2004
+    mode = (_hold(rng, n, steps, (2.0, 7.0))[..., 0] < 0.5).astype(int)
     low = np.array([config.height[0], -config.waist_yaw, -config.waist_roll])
     low = np.concatenate([low, config.waist_pitch[:1], [-config.vx, -config.vy, -config.yaw_rate]])
     high = np.array([config.height[1], config.waist_yaw, config.waist_roll])
@@ -85,7 +85,7 @@ def make_excitation(
     neutral = np.array([HEIGHT_NEUTRAL, 0, 0, 0, 0, 0, 0])
     neutral[0] = min(neutral[0], config.height[1])
     target = low + (high - low) * _hold(rng, n, steps, (1.0, 5.0), low.size)
-    keep = _hold(rng, n, steps, (1.0, 5.0), low.size) < 0.6  # noqa: PLR2004
+    keep = _hold(rng, n, steps, (1.0, 5.0), low.size) < 0.6
     target = np.where(keep, target, neutral)
     target[..., VELOCITIES] *= (mode == Mode.MOBILE)[..., None]
     slow = np.array([0.05, 0.3, 0.2, 0.2, 0.5, 0.5, 0.5])
@@ -95,7 +95,7 @@ def make_excitation(
     arms = _make_arms(rng, n, steps, config)
     push = _make_pushes(rng, n, steps, config)
     force = config.hand_force * (2 * _hold(rng, n, steps, (1.0, 4.0), 6) - 1)
-    force *= _hold(rng, n, steps, (2.0, 6.0)) < 0.5  # noqa: PLR2004
+    force *= _hold(rng, n, steps, (2.0, 6.0)) < 0.5
     return Excitation(command, mode, arms, push, force.reshape(steps, n, 2, 3))
 
 
@@ -133,7 +133,7 @@ def _make_arms(
     target = middle + config.arm_range * half * (2 * _hold(rng, n, steps, (1, 4), 14) - 1)
     # Part of the time both arms rest, or all joints stay within a third of their range.
     posture = _hold(rng, n, steps, (3.0, 8.0))
-    target = np.where(posture < 0.2, 0.0, np.where(posture < 0.6, target / 3, target))  # noqa: PLR2004
+    target = np.where(posture < 0.2, 0.0, np.where(posture < 0.6, target / 3, target))
     rate = config.arm_speed * (0.2 + 0.8 * _hold(rng, n, steps, (1, 4), len(low)))
     path = _follow(target, rate, np.zeros((n, len(low))))
     smooth = np.empty_like(path)

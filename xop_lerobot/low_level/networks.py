@@ -84,7 +84,7 @@ class OnnxNetwork(LoadedNetwork):
         shapes = [[_shape(tensor) for tensor in tensors] for tensors in (inputs, outputs)]
         states = [shape for shape in shapes[0][1:] if shape in shapes[1][1:]]
         if (
-            not all(len(each) >= 1 and len(each[0]) == 2 for each in shapes)  # noqa: PLR2004
+            not all(len(each) >= 1 and len(each[0]) == 2 for each in shapes)
             or len(states) != len(inputs) - 1
             or any(len(shape) not in (2, 3) for shape in states)
         ):
@@ -95,7 +95,7 @@ class OnnxNetwork(LoadedNetwork):
             )
         for tensor in (*inputs, *outputs):
             dims = tensor.type.tensor_type.shape.dim
-            batch = dims[1 if len(dims) == 3 else 0]  # noqa: PLR2004
+            batch = dims[1 if len(dims) == 3 else 0]
             batch.Clear()
             batch.dim_param = "batch"
         self.num_inputs, self.num_outputs = int(shapes[0][0][1]), int(shapes[1][0][1])
@@ -246,14 +246,14 @@ def _shape(tensor: onnx.ValueInfoProto) -> tuple[int | str, ...]:
 
 def _count(shape: tuple[int | str, ...]) -> int:
     """Numbers of one robot's state: (layers, batch, size) or (batch, size)."""
-    layers = int(shape[0]) if len(shape) == 3 else 1  # noqa: PLR2004
+    layers = int(shape[0]) if len(shape) == 3 else 1
     return layers * int(shape[-1])
 
 
 def _to_state(hidden: np.ndarray, shape: tuple[int | str, ...]) -> np.ndarray:
     """States as the network takes them. Shape (n, layers * size) -> (layers, n, size)."""
     state = hidden.astype(np.float32)
-    if len(shape) == 2:  # noqa: PLR2004
+    if len(shape) == 2:
         return state
     size = int(shape[-1])
     return np.ascontiguousarray(state.reshape(len(state), -1, size).transpose(1, 0, 2))
@@ -261,7 +261,7 @@ def _to_state(hidden: np.ndarray, shape: tuple[int | str, ...]) -> np.ndarray:
 
 def _from_state(state: np.ndarray) -> np.ndarray:
     """The reverse of `_to_state`."""
-    if state.ndim == 2:  # noqa: PLR2004
+    if state.ndim == 2:
         return state
     return state.transpose(1, 0, 2).reshape(state.shape[1], -1)
 
@@ -326,11 +326,8 @@ def load_weights(file: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
     weights = [layers[f"w{layer}"] for layer in range(count)]
     biases = [layers[f"b{layer}"] for layer in range(count)]
     shapes = [weight.shape for weight in weights]
-    chained = (
-        all(len(shape) == 2 for shape in shapes)
-        and all(  # noqa: PLR2004
-            before[1] == after[0] for before, after in zip(shapes, shapes[1:], strict=False)
-        )
+    chained = all(len(shape) == 2 for shape in shapes) and all(
+        before[1] == after[0] for before, after in zip(shapes, shapes[1:], strict=False)
     )
     if not chained or [bias.shape for bias in biases] != [shape[1:] for shape in shapes]:
         raise PolicyFileError(

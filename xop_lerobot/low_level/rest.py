@@ -52,13 +52,13 @@ class RestMap:
         held: Iterable[str] = (),
     ) -> None:
         self.entries, self.held = tuple(axes), frozenset(held)
-        if len(axes) != 2:  # noqa: PLR2004
+        if len(axes) != 2:
             raise BadValue(
                 f"rest needs two entries of the command, got {', '.join(axes) or 'none'}"
             )
         self._axes = [np.array(values, dtype=float) for values in axes.values()]
         for name, values in zip(axes, self._axes, strict=True):
-            if len(values) < 2 or (np.diff(values) <= 0).any():  # noqa: PLR2004
+            if len(values) < 2 or (np.diff(values) <= 0).any():
                 raise BadValue(f"rest: values of {name} must increase, got {values.tolist()}")
         shape = tuple(len(values) for values in self._axes)
         for name, rows in (("pitch", pitch), ("forward", forward)):

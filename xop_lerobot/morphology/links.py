@@ -176,7 +176,7 @@ def add_links(spec: mujoco.MjSpec, links: Iterable[Link], free_joint: str) -> No
         body = parent.add_body(name=link.name, pos=link.pos, quat=link.quat)
         body.explicitinertial = True
         body.mass, body.ipos = link.mass, link.com
-        if len(link.inertia) == 6:  # noqa: PLR2004
+        if len(link.inertia) == 6:
             body.fullinertia = link.inertia
         else:
             body.inertia, body.iquat = link.inertia, link.inertia_quat

@@ -180,7 +180,7 @@ class DoublePinchDetector:
         if self._closed or not self._taps or time - self._released_at <= self.config.max_gap:
             return False
         rested = self._began_at - self._toggled_at >= self.config.refractory
-        double = self._taps == 2 and not self._spoiled and rested  # noqa: PLR2004
+        double = self._taps == 2 and not self._spoiled and rested
         self._taps, self._spoiled = 0, False
         if double:
             self._toggled_at = time

@@ -77,7 +77,7 @@ class Recording:
         i = int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2))
         u = (t - self.t[i]) / (self.t[i + 1] - self.t[i])
         poses = interpolate_poses(self.poses[i], self.poses[i + 1], u)
-        nearest = i + (u >= 0.5)  # noqa: PLR2004
+        nearest = i + (u >= 0.5)
         mode = None if self.mode is None else Mode(int(self.mode[i + (u >= 1)]))
         return OperatorFrame(
             stamp,

@@ -59,7 +59,7 @@ class Track:
             return self.values[0 if i < 0 else -1].copy()
         u = compute_minimum_jerk((time - self.times[i]) / (self.times[i + 1] - self.times[i]))
         start, end = self.values[i], self.values[i + 1]
-        if len(start) == 7:  # noqa: PLR2004 (a pose)
+        if len(start) == 7:  # a pose
             return interpolate_poses(start, end, u)
         return (1 - u) * start + u * end
 
@@ -229,7 +229,7 @@ class _Reader:
             if "quat" in row:
                 quat = self.vector(f"{here}.quat", row["quat"], 4)
                 norm = float(np.linalg.norm(quat))
-                if abs(norm - 1) > 1e-3:  # noqa: PLR2004
+                if abs(norm - 1) > 1e-3:
                     raise BadScript(
                         self.source, f"{here}.quat (qw qx qy qz) must have norm 1, got {norm:g}"
                     )

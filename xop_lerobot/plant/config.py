@@ -186,7 +186,7 @@ def compute_num_steps(duration: float, time_step: float, what: str = "a step") -
     ratio = duration / time_step
     num_steps = round(ratio) if math.isfinite(ratio) else -1
     # 1e-6 of a step absorbs what floating point leaves of 0.02 / 0.005, and nothing else.
-    if num_steps < 0 or abs(ratio - num_steps) > 1e-6:  # noqa: PLR2004
+    if num_steps < 0 or abs(ratio - num_steps) > 1e-6:
         raise BadValue(
             f"{what} of {duration} s is not a whole multiple of the physics step of {time_step} s"
         )

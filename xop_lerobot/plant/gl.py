@@ -81,7 +81,7 @@ def make_gl_context(width: int, height: int) -> GlContext:
             # after an earlier one was imported and failed; its fault then says so.
             context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
             context.make_current()
-        except Exception as fault:  # noqa: BLE001 each library has its own errors
+        except Exception as fault:  # each library has its own errors
             faults[name] = str(fault) or type(fault).__name__
             continue
         return context

@@ -115,7 +115,7 @@ class PolicyLoop:
             BadValue: If `dt` is not a whole multiple of the policy's period.
         """
         steps = round(dt / POLICY_DT)
-        if abs(steps * POLICY_DT - dt) > 1e-9:  # noqa: PLR2004
+        if abs(steps * POLICY_DT - dt) > 1e-9:
             raise BadValue(
                 f"dt = {dt} s is not a whole multiple of the policy period {POLICY_DT} s"
             )

@@ -105,7 +105,7 @@ class RealtimeLoop:
     def _run(self) -> None:
         try:
             self._run_until_stopped()
-        except BaseException as failure:  # noqa: BLE001  raised in the caller
+        except BaseException as failure:  # raised in the caller
             self._failure = failure
             logger.exception("the policy loop has ended")
 

@@ -223,10 +223,10 @@ def start_viewer(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> Viewe
     if has_display() and _can_open_window():
         try:
             return WindowViewer(model, data)
-        except Exception as fault:  # noqa: BLE001 a display that does not work is no reason to stop
+        except Exception as fault:  # a display that does not work is no reason to stop
             logger.warning("no window can be opened (%s); showing the browser view", fault)
     viewer = BrowserViewer(model, data, port)
-    print(f"The simulation can be watched at {viewer.url}", flush=True)  # noqa: T201
+    print(f"The simulation can be watched at {viewer.url}", flush=True)
     return viewer
 
 

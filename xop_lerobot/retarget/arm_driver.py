@@ -123,7 +123,7 @@ class ArmDriver:
         """Where the wrists shall be in the world. Shapes (7,)."""
         goals = self._find_ik_goals(goal)
         hands = [arm.frame for arm in self.morphology.arms if arm.frame in goals]
-        if len(hands) != 2:  # noqa: PLR2004 a left and a right hand
+        if len(hands) != 2:  # a left and a right hand
             return compute_wrist_goals(goals, head)
         left, right = hands
         walking = goal.mode is Mode.MOBILE

@@ -61,7 +61,7 @@ class StampedPlan(NamedTuple):
             Shape (3,); None beyond what was predicted.
         """
         velocities, step = self.plan.velocities, (time - self.time) / POLICY_DT
-        if not -0.5 <= step <= len(velocities) - 0.5:  # noqa: PLR2004 half a step is nothing
+        if not -0.5 <= step <= len(velocities) - 0.5:  # half a step is nothing
             return None
         step = min(max(step, 0.0), len(velocities) - 1.0)
         first = min(int(step), max(len(velocities) - 2, 0))

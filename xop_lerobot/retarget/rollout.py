@@ -61,7 +61,7 @@ class PolicyRollout:
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         policy.adapt(self.model)
         self.substeps = round(POLICY_DT / model.opt.timestep)
-        if abs(self.substeps * model.opt.timestep - POLICY_DT) > 1e-9:  # noqa: PLR2004
+        if abs(self.substeps * model.opt.timestep - POLICY_DT) > 1e-9:
             raise BadValue(
                 f"the policy period {POLICY_DT} s must be a whole multiple of the time step "
                 f"{model.opt.timestep} s"

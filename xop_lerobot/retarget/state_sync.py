@@ -167,7 +167,7 @@ class StateSync:
                 return self._last
             self._last = self._solve(float(time), qpos, qvel, mode, expected)
             self._seen = (qpos.copy(), qvel.copy())
-        except Exception as error:  # noqa: BLE001 whatever it is, the control loop goes on
+        except Exception as error:  # whatever it is, the control loop goes on
             if not self.failures:
                 logger.warning("state synchronisation failed: %r; the measurement is used", error)
             self._forget()

@@ -203,7 +203,7 @@ def _inverse_left_jacobian(turn: np.ndarray) -> np.ndarray:
     """
     skew = _skew(turn)
     angle = float(np.sqrt(turn @ turn))
-    if angle < 1e-4:  # noqa: PLR2004 the series' next term is under 1e-12
+    if angle < 1e-4:  # the series' next term is under 1e-12
         factor = 1 / 12
     else:
         factor = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))

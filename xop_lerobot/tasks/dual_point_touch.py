@@ -138,7 +138,7 @@ class DualPointTouch(Task):
         side = int(rng.integers(4))
         facing = side * math.pi / 2
         ahead = make_direction(facing)
-        wall = self._room[1] if side < 2 else self._room[0]  # noqa: PLR2004 front, left
+        wall = self._room[1] if side < 2 else self._room[0]  # front, left
         depth = abs(float(wall @ ahead[:2])) - rng.uniform(*NEAR_WALL)
         along = rng.uniform(-ALONG_WALL, ALONG_WALL)
         return depth * ahead + along * make_direction(facing + math.pi / 2), facing

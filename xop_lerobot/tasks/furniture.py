@@ -49,7 +49,7 @@ def add_object_body(
     return body
 
 
-def add_solid(  # noqa: PLR0913 a geom has as many properties
+def add_solid(  # a geom has as many properties
     body: mujoco.MjsBody,
     name: str,
     kind: str,

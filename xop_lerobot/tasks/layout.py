@@ -170,6 +170,6 @@ def measure_pad(morphology: Morphology) -> Pad:
     if not pads:
         return Pad(0.0, 0.0, wrist_end)
     farthest = max(pad[0] for pad in pads)
-    alike = [pad for pad in pads if pad[0] > farthest - 0.02]  # noqa: PLR2004 in the docstring
+    alike = [pad for pad in pads if pad[0] > farthest - 0.02]  # in the docstring
     depth, _, forward = max(alike, key=lambda pad: pad[1])
     return Pad(forward, depth, wrist_end)

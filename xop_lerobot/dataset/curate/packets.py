@@ -59,7 +59,7 @@ def is_whole_av1(packet: bytes) -> bool:
             return kind in _OBU_PICTURES and place < end
         length, shift = 0, 0
         while True:
-            if place >= end or shift > 49:  # noqa: PLR2004 at most eight bytes
+            if place >= end or shift > 49:  # at most eight bytes
                 return False
             byte = packet[place]
             length |= (byte & 0x7F) << shift

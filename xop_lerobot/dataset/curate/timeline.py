@@ -349,6 +349,6 @@ def describe_changes(entry: EpisodeEntry, fps: float) -> list[dict[str, Any]]:
         match change:
             case {"frame": int(frame), "change": what}:
                 if isinstance(what, dict):
-                    what = ", ".join(f"{name} {value}" for name, value in what.items())  # noqa: PLW2901
+                    what = ", ".join(f"{name} {value}" for name, value in what.items())
                 found.append({"t": round(frame / fps, 3), "text": str(what)[:300]})
     return found[:MOST_RUNS]

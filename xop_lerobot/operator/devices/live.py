@@ -159,7 +159,7 @@ class LiveDevice(Device):
                 lost = StreamLost("the stream has ended")
             except StreamLost as error:
                 lost = error
-            except Exception as error:  # noqa: BLE001  the robot holds, whatever it was
+            except Exception as error:  # the robot holds, whatever it was
                 self._log.exception("%s: its stream cannot be read", self.address)
                 lost = StreamLost(f"{type(error).__name__}: {error}")
             with self._lock:

@@ -264,7 +264,7 @@ def put_down(mind: Mind) -> Doing:
         check_held(mind)
         height = compute_height_over_spot(mind)
         mind.note(f"box {100 * height:.1f} cm over the table")
-        if height < 0.012:  # noqa: PLR2004
+        if height < 0.012:
             break
         if height > BY_KNEES:
             yield from bend_knees(mind, height)

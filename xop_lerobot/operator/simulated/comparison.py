@@ -85,7 +85,7 @@ def simulate_frames(seed: int, duration: float, rate: float = RATE) -> Iterator[
 def _move_by_chance(mind: Mind, body: Body, rng: np.random.Generator) -> None:
     """Begin to walk a step or two, or to reach for something."""
     posture = body.posture
-    if rng.random() < 0.5:  # noqa: PLR2004
+    if rng.random() < 0.5:
         from dataclasses import replace  # noqa: PLC0415
 
         step = np.array([*rng.uniform(-1.2, 1.2, 2), rng.uniform(-1.5, 1.5)])

@@ -83,9 +83,9 @@ def plan_place(mind: Mind, closer: float = 0.0) -> np.ndarray:
     middle = (points["left"] + points["right"]) / 2
     across = (points["left"] - points["right"])[:2]
     head = mind.eyes.pose("head")
-    if np.linalg.norm(across) > 0.15:  # noqa: PLR2004
+    if np.linalg.norm(across) > 0.15:
         heading = float(np.arctan2(-across[0], across[1]))
-    elif np.linalg.norm(middle[:2] - head[:2]) > 0.3:  # noqa: PLR2004
+    elif np.linalg.norm(middle[:2] - head[:2]) > 0.3:
         heading = float(np.arctan2(*(middle[:2] - head[:2])[::-1]))
     else:
         heading = compute_heading(head[3:])

@@ -72,7 +72,7 @@ def get_half_extents(mind: Mind, heading: float) -> np.ndarray:
     """Half the box's extents along a heading, across it, and up [m]. Shape (3,)."""
     size = mind.eyes.size("box")
     across = abs(np.sin(heading - float(quat_yaw(mind.eyes.pose("box")[3:]))))
-    return size[[1, 0, 2]] if across > 0.5 else size  # noqa: PLR2004
+    return size[[1, 0, 2]] if across > 0.5 else size
 
 
 def compute_sides(mind: Mind, outside: float, before: float = 0.0) -> dict[str, np.ndarray]:

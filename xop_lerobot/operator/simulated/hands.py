@@ -235,7 +235,7 @@ def look_at_work(mind: Mind, points: Mapping[str, np.ndarray]) -> Doing:
         more = max(more, NOD_MORE)
     body, last = mind.body, mind.body.posture
     nod = float(np.clip(last.look[1] + more, last.look[1], LARGEST_NOD))
-    if nod - last.look[1] < 0.02:  # noqa: PLR2004 not worth it
+    if nod - last.look[1] < 0.02:  # not worth it
         return
     mind.note(f"nod by {np.degrees(nod - last.look[1]):.0f}°")
     room = body.compute_hands_in_room()

@@ -166,7 +166,7 @@ def go_to(
         target = mind.belief.place_to_own(aim)
         target[:2] += mind.scatter(miss, 2)
         target[2] += float(mind.scatter(abs(turn), 1)[0])
-        yield from _walk(mind, target, hands, leg % 3 == 2, LADEN if laden else 1.0)  # noqa: PLR2004
+        yield from _walk(mind, target, hands, leg % 3 == 2, LADEN if laden else 1.0)
         yield from mind.settle(patience=2.5)
         if is_strained(mind) and not laden:
             yield from _come_back(mind, own, seen, turn_then)
