@@ -130,6 +130,12 @@ class Morphology(ABC):
     standing_reach: float = 0.3
     """How far from where it rests the head of a robot that stands is led [m]."""
 
+    point_heights: tuple[float, float] | None = None
+    """Between which heights over the floor its palms get to points [m]; None keeps tasks at their
+    usual ones."""
+    top_heights: tuple[float, float] | None = None
+    """Between which heights a top may be for its hands to get beside a box on it [m]."""
+
     hull_points: dict[str, float] = {}
     """Sites on the hull of the robot and the radius around each [m], for obstacles."""
 

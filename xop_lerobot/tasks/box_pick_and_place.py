@@ -66,9 +66,6 @@ TABLE_DISTANCE = (0.95, 1.15)
 LEVELS = {"support": (-0.03, 0.03), "table": (-0.06, 0.0)}
 """Heights of the tops about that at which the box's middle is where palms are at rest [m]."""
 
-TOPS = {"g1": (0.30, 1.10), "rby1": (0.30, 1.30)}
-"""Heights at which tops may be asked for, by robot [m]: hands get beside a box on them."""
-
 WRIST_GAP = 0.01
 """Between the end of the arm, which is thicker than the hand, and the box [m]."""
 LIFT, LIFTED_S = 0.03, 3.0
@@ -109,7 +106,7 @@ class BoxPickAndPlace(Task):
         """Where the tops of support and table may be."""
         level = self.reach.height - BOX[2]
         usual = (level + LEVELS["table"][0], level + LEVELS["support"][1])
-        return dict.fromkeys(self.furniture, TOPS.get(self.morphology.name, usual))
+        return dict.fromkeys(self.furniture, self.morphology.top_heights or usual)
 
     @property
     def hints(self) -> Mapping[str, float]:

@@ -35,8 +35,6 @@ HEIGHT_SPREAD = 0.27
 """Heights of the middle about that of the palms at rest; low ones need a squat [m]."""
 LEVEL_SPREAD, DEPTH_SPREAD = 0.08, 0.04
 """Largest difference of each point's height and depth from the middle's [m]."""
-POINTS = {"g1": (0.25, 1.30), "rby1": (0.25, 1.50)}
-"""Heights at which points may be asked for, by robot [m]: hands get there."""
 FACING_SPREAD = 0.6
 """By how much the points face aside from where the robot sees them at the start [rad]."""
 NEAR_WALL = (0.25, 0.40)
@@ -78,7 +76,7 @@ class DualPointTouch(Task):
         """Where the points may be."""
         spread = HEIGHT_SPREAD + LEVEL_SPREAD
         usual = (self.reach.height - spread, self.reach.height + spread)
-        return {"points": POINTS.get(self.morphology.name, usual)}
+        return {"points": self.morphology.point_heights or usual}
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add two balls that touch nothing, on thin rods for the eye."""

@@ -115,6 +115,7 @@ class G1(Morphology):
     fall_tilt = 0.8
     wheeled = False
     standing_reach = STANDING_REACH
+    point_heights, top_heights = (0.25, 1.3), (0.3, 1.1)
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
         """Build G1 alone."""

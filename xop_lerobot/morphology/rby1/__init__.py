@@ -133,6 +133,7 @@ class RBY1(Morphology):
     servo_gap = 0.15
     posture_limits = POSTURE_LIMITS
     standing_reach = STANDING_REACH
+    point_heights, top_heights = (0.25, 1.5), (0.3, 1.3)
     hull_points = HULL
     hull_hands = ("left_palm", "right_palm")
     fall_height = -0.2
