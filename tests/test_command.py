@@ -105,6 +105,18 @@ def test_a_policy_sets_the_rates_of_a_robot_that_stands():
         SPACE.fit({}, {}, {"high": 1.0})
 
 
+def test_a_policy_sets_the_rate_at_which_a_walk_ends():
+    fitted = SPACE.fit({}, {}, {}, {"vx": 0.5})
+    walking = np.array([0.7, 1.0])
+    np.testing.assert_array_equal(
+        fitted.compute_max_rate(Mode.MOBILE, walking), SPACE.compute_max_rate(Mode.MOBILE, walking)
+    )
+    assert fitted.compute_max_rate(Mode.STATIONARY, walking)[1] == 0.5
+    with pytest.raises(BadValue) as error:
+        SPACE.fit({}, {}, {}, {"height": 0.5})
+    assert str(error.value) == "the policy's stop rate must be of a velocity, got 'height'"
+
+
 def test_ranges_that_do_not_fit_the_robot_are_named():
     with pytest.raises(BadValue) as error:
         SPACE.fit({Mode.MOBILE: {"height": (0.2, 0.4)}}, {})

@@ -149,8 +149,8 @@ class CommandSpace:
             stop_rates: `CommandDim.stop_rate` of velocities, by entry.
 
         Raises:
-            BadValue: If a range and the robot's bounds have nothing in common, or a rate is not
-                positive.
+            BadValue: If a range and the robot's bounds have nothing in common, a rate is not
+                positive, or a stop rate is not of a velocity.
             UnknownName: If there is no such entry.
         """
         for mode, limits in ranges.items():
@@ -172,6 +172,8 @@ class CommandSpace:
             dims[i] = replace(dims[i], **{limit: float(rate)})
         for name, rate in (stop_rates or {}).items():
             i = self.index(name)
+            if not dims[i].mobile_only:
+                raise BadValue(f"the policy's stop rate must be of a velocity, got {name!r}")
             dims[i] = replace(dims[i], stop_rate=float(rate))
         fitted = replace(self, dims=tuple(dims), ranges=ranges, dead_zones=dead_zones)
         low = np.min([fitted.bounds(mode)[0] for mode in Mode], axis=0)

@@ -207,15 +207,16 @@ def measure_rest(policy: LowLevelPolicy, threads: int = 2) -> MeasuredRest:
     soles = _SoleFinder()
     memory, up = policy.initial_memory(n), np.ones(n, bool)
     pitches, places = [], []
-    for step in range(400):
-        command = space.neutral + min(step / 150, 1.0) * (final - space.neutral)
+    ramp, settled, end = (round(time_s / POLICY_DT) for time_s in (3.0, 6.0, 8.0))
+    for step in range(end):
+        command = space.neutral + min(step / ramp, 1.0) * (final - space.neutral)
         targets, memory = policy.act(
             simulation.qpos, simulation.qvel, command, arms, memory, Mode.STATIONARY
         )
         simulation.step(targets)
         up &= ~simulation.fallen()
         simulation.reset(~up)
-        if step >= 300 and step % 5 == 0:
+        if step >= settled and step % 5 == 0:
             gravity = compute_projected_gravity(simulation.qpos[:, 3:7])
             pitches.append(np.arcsin(np.clip(gravity[:, 0], -1, 1)))
             places.append([soles.compute_forward(qpos) for qpos in simulation.qpos])
