@@ -10,7 +10,8 @@ STATIONARY = (Mode.STATIONARY,)
 
 EFFECTS = (
     # While walking the policy neither squats nor turns its waist.
-    Effect(Acts.HEIGHT, lag_s=0.3, modes=STATIONARY),
+    # Behind a ramp of 0.25 m/s the default policy is by 0.21 s, FALCON by 0.23.
+    Effect(Acts.HEIGHT, lag_s=0.2, modes=STATIONARY),
     Effect(Acts.JOINT, "waist_yaw_joint", lag_s=0.2, modes=STATIONARY),
     Effect(Acts.JOINT, "waist_roll_joint", lag_s=0.1, effort=5.0),
     Effect(Acts.JOINT, "waist_pitch_joint", lag_s=0.1, effort=2.0),
