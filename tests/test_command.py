@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -90,31 +88,21 @@ def test_a_policy_narrows_the_bounds_by_mode():
     np.testing.assert_array_equal(longer.bounds(Mode.MOBILE)[0], [0.7, -1.0, -1.0])
 
 
-def test_a_policy_sets_the_rates_of_a_robot_that_stands():
-    rates = {"height": 0.8, "vx": 0.05}
-    sways = replace(SPACE.dims[1], sway=0.2, sway_rate=0.1)
-    fitted = replace(SPACE, dims=(SPACE.dims[0], sways)).fit({}, {}, rates)
-    still = np.array([0.7, 0.0])
-    np.testing.assert_array_equal(fitted.compute_max_rate(Mode.STATIONARY, still), [0.8, 0.05])
-    walking = fitted.compute_max_rate(Mode.MOBILE, still)
-    np.testing.assert_array_equal(walking, [0.8, SPACE.dims[1].max_rate])
-    with pytest.raises(BadValue) as error:
-        SPACE.fit({}, {}, {"height": 0.0})
-    assert str(error.value) == "the policy's rate of command 'height' must be positive, got 0.0"
-    with pytest.raises(UnknownName):
-        SPACE.fit({}, {}, {"high": 1.0})
-
-
 def test_a_policy_sets_the_rate_at_which_a_walk_ends():
-    fitted = SPACE.fit({}, {}, {}, {"vx": 0.5})
+    fitted = SPACE.fit({}, {}, {"vx": 0.5})
     walking = np.array([0.7, 1.0])
     np.testing.assert_array_equal(
         fitted.compute_max_rate(Mode.MOBILE, walking), SPACE.compute_max_rate(Mode.MOBILE, walking)
     )
     assert fitted.compute_max_rate(Mode.STATIONARY, walking)[1] == 0.5
     with pytest.raises(BadValue) as error:
-        SPACE.fit({}, {}, {}, {"height": 0.5})
+        SPACE.fit({}, {}, {"height": 0.5})
     assert str(error.value) == "the policy's stop rate must be of a velocity, got 'height'"
+    with pytest.raises(BadValue) as error:
+        SPACE.fit({}, {}, {"vx": 0.0})
+    assert str(error.value) == "stop_rate of command 'vx' must be positive, got 0.0"
+    with pytest.raises(UnknownName):
+        SPACE.fit({}, {}, {"high": 1.0})
 
 
 def test_ranges_that_do_not_fit_the_robot_are_named():

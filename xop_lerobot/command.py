@@ -136,7 +136,6 @@ class CommandSpace:
         self,
         ranges: Mapping[Mode, Mapping[str, tuple[float, float]]],
         dead_zones: Mapping[str, float],
-        rates: Mapping[str, float] | None = None,
         stop_rates: Mapping[str, float] | None = None,
     ) -> CommandSpace:
         """The part of this space that a low-level policy can do.
@@ -144,13 +143,11 @@ class CommandSpace:
         Args:
             ranges: Bounds in each mode, by entry; entries that are not named keep theirs.
             dead_zones: Size of a velocity under which nothing happens, by entry.
-            rates: Rate limits of entries where the robot stands, in place of its own: of a
-                velocity that of its sway [its unit per second].
             stop_rates: `CommandDim.stop_rate` of velocities, by entry.
 
         Raises:
-            BadValue: If a range and the robot's bounds have nothing in common, a rate is not
-                positive, or a stop rate is not of a velocity.
+            BadValue: If a range and the robot's bounds have nothing in common, or a stop rate is
+                not positive, or not of a velocity.
             UnknownName: If there is no such entry.
         """
         for mode, limits in ranges.items():
@@ -162,14 +159,6 @@ class CommandSpace:
                         f"and the policy's range in {mode.name.lower()} mode is {least} to {most}"
                     )
         dims = list(self.dims)
-        for name, rate in (rates or {}).items():
-            i = self.index(name)
-            if not rate > 0:
-                raise BadValue(
-                    f"the policy's rate of command {name!r} must be positive, got {rate}"
-                )
-            limit = "sway_rate" if dims[i].mobile_only else "max_rate"
-            dims[i] = replace(dims[i], **{limit: float(rate)})
         for name, rate in (stop_rates or {}).items():
             i = self.index(name)
             if not dims[i].mobile_only:

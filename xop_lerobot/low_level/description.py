@@ -304,8 +304,6 @@ class PolicyTable(_Strict, frozen=True):
         stands_below: In mobile mode a robot stands as well while all these entries of the command
             are smaller in size.
         dead_zones: Size of a velocity under which nothing happens, by entry of the command.
-        rates: How fast the command of a robot that stands may change, by entry, in place of the
-            robot's own limits; of a velocity, by which it sways [unit of the entry per second].
         stop_rates: How fast velocities may end where the robot is to stand, by entry, in place of
             the robot's own limits [unit of the entry per second].
         rest: How the base of a standing robot leans and moves unasked; None where it does not.
@@ -325,7 +323,6 @@ class PolicyTable(_Strict, frozen=True):
     ranges: dict[Literal["stationary", "mobile"], dict[str, tuple[float, float]]] = {}
     stands_below: dict[str, float] = {}
     dead_zones: dict[str, float] = {}
-    rates: dict[str, float] = {}
     stop_rates: dict[str, float] = {}
     rest: Rest | None = None
     handover_s: float = 0.2

@@ -119,7 +119,6 @@ class NetworkPolicy(LowLevelPolicy):
         self.arm_limits = _join_limits(joints, table, stationary.table, mobile.table)
         self.motors = MotorSet.read(table.motors, joints)
         self.dead_zones: Mapping[str, float] = mobile.table.dead_zones
-        self.rates: Mapping[str, float] = stationary.table.rates
         self.stop_rates: Mapping[str, float] = mobile.table.stop_rates
         self.rest = _make_rest(stationary, joints)
         self.ranges = {

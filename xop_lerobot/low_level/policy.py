@@ -54,8 +54,6 @@ class LowLevelPolicy(ABC):
     """Commands that it can do in each mode, by entry, where that is less than the robot's."""
     dead_zones: Mapping[str, float] = {}
     """Size of a velocity under which nothing happens, by entry of the command."""
-    rates: Mapping[str, float] = {}
-    """Rate limits of the command where the robot stands, by entry, in place of the robot's own."""
     stop_rates: Mapping[str, float] = {}
     """Rate limits of velocities that end because the robot is to stand, by entry."""
     rest: RestMap | None = None

@@ -174,7 +174,7 @@ class Morphology(ABC):
         fitted = copy.copy(self)
         fitted.__dict__.pop("layout", None)
         fitted.command_space = self.command_space.fit(
-            policy.ranges, policy.dead_zones, policy.rates, policy.stop_rates
+            policy.ranges, policy.dead_zones, policy.stop_rates
         )
         fitted.rest = policy.rest
         return fitted
