@@ -171,7 +171,7 @@ class MeasuredRest(NamedTuple):
     Attributes:
         axes: Entries of the command and their values, those that the policy can do.
         pitch: Pitch of the base [rad]. A row for each value of the first entry.
-        forward: Place of the base before the middle of the feet [m], the same.
+        forward: Place of the base ahead of the middle of the feet [m], the same.
     """
 
     axes: dict[str, tuple[float, ...]]
@@ -238,7 +238,7 @@ class _SoleFinder:
         self._sites = [model.site(name).id for name in morphology.contact_points]
 
     def compute_forward(self, qpos: np.ndarray) -> float:
-        """Distance of the base before the middle of the feet, along its heading [m]."""
+        """Distance of the base ahead of the middle of the feet, along its heading [m]."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         middle = self._data.site_xpos[self._sites].mean(axis=0)

@@ -277,7 +277,7 @@ class Rest(_Strict, frozen=True):
     Attributes:
         axes: Two entries of the command and the values at which it was measured.
         pitch: Pitch of the base [rad], a row for each value of the first entry.
-        forward: Place of the base before the middle of the feet [m], the same.
+        forward: Place of the base ahead of the middle of the feet [m], the same.
     """
 
     axes: dict[str, tuple[float, ...]]

@@ -15,7 +15,7 @@ class BaseRest(NamedTuple):
 
     Attributes:
         pitch: Pitch of the base [rad]. Shape (...).
-        forward: Place of the base before the middle of the feet [m]. Shape (...).
+        forward: Place of the base ahead of the middle of the feet [m]. Shape (...).
         pitch_slope: Derivative of `pitch` by the two entries. Shape (..., 2).
         forward_slope: Derivative of `forward` by the two entries. Shape (..., 2).
     """
@@ -37,7 +37,7 @@ class RestMap:
     Args:
         axes: Two entries of the command and their increasing grid values.
         pitch: Pitch of the base [rad]; a row for each value of the first entry.
-        forward: Place of the base before the middle of the feet [m], the same.
+        forward: Place of the base ahead of the middle of the feet [m], the same.
         held: Entries whose joint does not follow: the base leans in its place.
 
     Raises:

@@ -54,7 +54,9 @@ class CommandModel:
     ) -> None:
         self.space, self.effects, self.pivot = space, effects, pivot
         self._rest = rest
-        self._rests = np.array([space.index(name) for name in rest.entries] if rest else [], int)
+        self._rest_entries = np.array(
+            [space.index(name) for name in rest.entries] if rest else [], int
+        )
         self._shares: dict[float, np.ndarray] = {}
         self._nv = model.nv
         self._twist = [
@@ -96,9 +98,8 @@ class CommandModel:
         self._moves_base = {
             mode: bool((acting & self._is_velocity).any()) for mode, acting in self._acting.items()
         }
-        # What a body that may not move does is not asked.
-        leans = bool(len(self._rests) and self._acting[Mode.STATIONARY][self._rests].any())
-        self._leans = leans
+        # A base leans for what is free to act; it keeps the posture that it has for all else.
+        self._leans = bool(self._acting[Mode.STATIONARY][self._rest_entries].any())
 
     def acting(self, mode: Mode) -> np.ndarray:
         """Which free entries have an effect in `mode`. Shape (k,), bool."""
@@ -150,7 +151,7 @@ class CommandModel:
             limited[:, k] = executed
         return limited
 
-    def find_lowest(self) -> float:
+    def find_lowest_height(self) -> float:
         """Lowest base height that can be commanded [m]; infinite where it can't be."""
         low, _ = self.space.bounds(Mode.STATIONARY)
         heights = [low[i] for i, effect in enumerate(self.effects) if effect.acts is Acts.HEIGHT]
@@ -272,7 +273,7 @@ class CommandModel:
     def _find_rest(self, command: np.ndarray) -> BaseRest:
         """How a standing base rests under a command. Shape (..., k)."""
         assert self._rest is not None
-        first, second = self._rests
+        first, second = self._rest_entries
         return self._rest(command[..., first], command[..., second])
 
     def _sway_base(
@@ -351,7 +352,7 @@ class CommandModel:
         lean = np.array([c, -n * sine, n * cosine, 0.0])
         future[3:7] = quat_multiply(lean, future[3:7])
         left = quat_rotate(quat_conjugate(future[3:7]), np.array([-sine, cosine, 0.0]))
-        for i, entry in enumerate(self._rests):
+        for i, entry in enumerate(self._rest_entries):
             if self._acting[Mode.STATIONARY][entry]:
                 gain = share[entry] * slope[entry]
                 jacobian[0, entry] += gain * after.forward_slope[i] * cosine

@@ -109,7 +109,7 @@ class MpcRetargeter(Retargeter):
             morphology.fall_tilt,
             morphology.fall_height,
             height,
-            self.command_model.find_lowest(),
+            self.command_model.find_lowest_height(),
             self.command_model.compute_rest_tilt,
         )
         self.costs: tuple[Cost, ...] = make_costs(
