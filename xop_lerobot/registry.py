@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import cast
 
 from xop_lerobot.errors import DuplicateName, UnknownName
 
@@ -29,9 +30,14 @@ class Registry[T]:
         self._things[name] = thing
         return thing
 
-    def register(self, name: str) -> Callable[[T], T]:
+    def register[Thing](self, name: str) -> Callable[[Thing], Thing]:
         """Return a decorator that registers what it decorates under `name`."""
-        return lambda thing: self.add(name, thing)
+
+        def decorate(thing: Thing) -> Thing:
+            self.add(name, cast(T, thing))  # that Thing is a T can't be said of a type variable
+            return thing
+
+        return decorate
 
     def remove(self, name: str) -> None:
         """Forget `name` (tests register toys and take them away again)."""

@@ -49,7 +49,7 @@ class VideoQueue:
         """Wait until the image files have caught up; workers that have died are left alone."""
         images = getattr(self._writer, "image_writer", None)
         queue = getattr(images, "queue", None)
-        if queue is None:
+        if images is None or queue is None:
             return
         workers = (*images.threads, *images.processes)
         while _count(queue) >= MAX_IMAGES and any(worker.is_alive() for worker in workers):

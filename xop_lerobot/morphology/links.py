@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -114,7 +114,7 @@ def mirror(shape: Shape) -> Shape:
     )
 
 
-def look(link: str, kind: str, size: tuple[float, ...], material: str, **where: object) -> Shape:
+def look(link: str, kind: str, size: tuple[float, ...], material: str, **where: Any) -> Shape:
     """Return a shape that is seen and collides with nothing."""
     return Shape(link, kind, size, material=material, collides=False, **where)
 

@@ -172,7 +172,7 @@ class Morphology(ABC):
             BadValue: If they have nothing in common with the robot's.
         """
         fitted = copy.copy(self)
-        fitted.__dict__.pop("layout", None)
+        vars(fitted).pop("layout", None)
         fitted.command_space = self.command_space.fit(
             policy.ranges, policy.dead_zones, policy.stop_rates
         )

@@ -87,7 +87,7 @@ class Guidance:
         name = next((name for name in poses if name in goal.poses), None)
         drives = name is not None and self._drives(goal.mode)
         room = self._room.compute(qpos, time) if drives and self._room is not None else math.inf
-        if drives and _compute_speed(goal, name) < _STILL:
+        if name is not None and drives and _compute_speed(goal, name) < _STILL:
             twist = self._command_model.compute_twist(executed)
             return self._lead_along_route(
                 qpos, twist, poses, goal, name, times, config, room, ahead

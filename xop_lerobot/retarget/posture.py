@@ -112,7 +112,7 @@ class Repertoire:
 
 def make_level(base: np.ndarray) -> np.ndarray:
     """Place on the ground and heading of a base. Shape (7,)."""
-    return make_pose([*base[:2], 0.0], quat_from_yaw(quat_yaw(base[3:])))
+    return make_pose(np.array([*base[:2], 0.0]), quat_from_yaw(quat_yaw(base[3:])))
 
 
 class PostureSearch:
@@ -146,11 +146,14 @@ class PostureSearch:
     ) -> None:
         self.problem, self._repertoire, self._used = problem, repertoire, used
         self.space = problem.command_model.space
-        self._limits = tuple(self.space.restrict(each, Mode.STATIONARY) for each in limits)
-        whole = (self.space.low, self.space.high)
-        self._everywhere = tuple(self.space.restrict(each, Mode.STATIONARY) for each in whole)
+        self._limits = self._restrict(limits)
+        self._everywhere = self._restrict((self.space.low, self.space.high))
         self._strict, self._looks_at_way = strict, looks_at_way
         self.reset()
+
+    def _restrict(self, bounds: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        low, high = bounds
+        return self.space.restrict(low, Mode.STATIONARY), self.space.restrict(high, Mode.STATIONARY)
 
     def reset(self) -> None:
         """Forget the last solution."""

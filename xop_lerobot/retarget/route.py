@@ -191,10 +191,11 @@ class RoutePlanner:
 
     def _find_free(self, way: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:
         """The way itself, or one with a detour where its turn is barred. Shape (n, 3)."""
-        assert self._footprint is not None
+        footprint = self._footprint
+        assert footprint is not None
 
         def find_bar(candidate: np.ndarray) -> int | None:
-            clearance = self._footprint.compute_clearance(candidate[:, :2], candidate[:, 2])
+            clearance = footprint.compute_clearance(candidate[:, :2], candidate[:, 2])
             bars = np.flatnonzero(clearance < min(clearance[0], 0.0) - _DEEPER)
             return int(bars[0]) if len(bars) else None
 
@@ -271,7 +272,7 @@ def _face(
     aim: _Aim, x: float, y: float, heading: float, sign: float
 ) -> tuple[float, float, float, float]:
     """Effort of driving forwards (1) or backwards (-1), the turn before, and the way [m]."""
-    facing = heading
+    facing, end, dx, dy = heading, heading, 0.0, 0.0
     for _ in range(_ITERATIONS):
         end = aim.clip(facing)
         dx, dy = aim.find_way(x, y, end)

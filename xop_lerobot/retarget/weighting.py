@@ -74,6 +74,7 @@ def _compute_ess_weights(excess: np.ndarray, wanted: float) -> np.ndarray:
     powers, basis = np.empty((2, count)), np.empty((2, count))  # e and e²; 1 and x
     basis[0], basis[1] = 1.0, excess
     weights, squared = powers
+    total = 1.0
     for _ in range(_MAX_ITERATIONS):
         temperature = math.exp(position)
         np.multiply(excess, -1 / temperature, out=weights)

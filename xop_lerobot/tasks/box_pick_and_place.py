@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -88,7 +88,7 @@ class BoxPickAndPlace(Task):
     name = "box_pick_and_place"
     instruction = "Pick up the box with both hands and put it on the green mark of the table."
     time_limit = 150.0
-    scenes: Mapping[str, str] = {"g1": "empty", "rby1": "small_room"}
+    scenes: ClassVar[Mapping[str, str]] = {"g1": "empty", "rby1": "small_room"}
     furniture = ("support", "table")
     handled = ("support", "table")
     passable = ("support_top", "table_top")

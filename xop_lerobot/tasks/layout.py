@@ -116,7 +116,7 @@ def measure_draw_in(morphology: Morphology) -> float:
 
     rest, drawn_in = find_wrists(), 0.0
     for way in DRAW_IN * np.array([1, 2, 3]) / 3:
-        back = make_pose(np.array([-way, 0, 0]), [1.0, 0, 0, 0])
+        back = make_pose(np.array([-way, 0, 0]), np.array([1.0, 0, 0, 0]))
         goals = {name: pose_multiply(back, pose) for name, pose in rest.items()}
         for _ in range(_STEPS):
             angles = ik.solve(qpos, angles, goals, _DT)

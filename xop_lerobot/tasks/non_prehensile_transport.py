@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
 import numpy as np
@@ -82,7 +82,7 @@ class NonPrehensileTransport(Task):
     name = "non_prehensile_transport"
     instruction = "Carry the toy on the open left palm past the obstacles and drop it into the box."
     time_limit = 60.0
-    scenes: Mapping[str, str] = {"g1": "empty", "rby1": "small_room"}
+    scenes: ClassVar[Mapping[str, str]] = {"g1": "empty", "rby1": "small_room"}
     furniture = ("container", "obstacle_0", "obstacle_1")
     handled = ("container",)
     close_by = ("obstacle_0", "obstacle_1")
@@ -139,9 +139,13 @@ class NonPrehensileTransport(Task):
     def _edge(self) -> float:
         return palm.TRAY_HALF[1] if self.has_tray else palm.BARE_EDGE
 
-    @cached_property
+    @property
     def start_arms(self) -> Mapping[str, float]:
         """Left arm with the palm up before the robot [rad]."""
+        return self._start_arms
+
+    @cached_property
+    def _start_arms(self) -> Mapping[str, float]:
         return palm.find_start_arms(self.morphology, self.start_palm, self._palm_in_wrist)
 
     @cached_property
@@ -210,7 +214,7 @@ class NonPrehensileTransport(Task):
         across = obstacle + OBSTACLE[0] + FREE + 2 * edge + FALL + rng.uniform(0, SPREAD)
         forward = self.toy_in_palm[0] + rng.uniform(*AHEAD)
         opening = origin + forward * ahead - across * left
-        opening[2] = start[2] - rng.uniform(*sorted(RIM))
+        opening[2] = start[2] - rng.uniform(min(RIM), max(RIM))
         # Its X axis, along which the opening is 10 cm long, points to the right.
         quat = quat_from_yaw(facing - math.pi / 2)
         furniture.place(self.plant, "container", opening, quat)

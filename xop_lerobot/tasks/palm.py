@@ -57,7 +57,8 @@ def add_tray(spec: mujoco.MjSpec, site: str, pad: Pad) -> None:
 
     frame = next(each for each in spec.sites if each.name == site)
     offset = make_pose(
-        np.array([compute_tray_forward(pad), 0, -pad.depth - TRAY_HALF[2]]), [1.0, 0, 0, 0]
+        np.array([compute_tray_forward(pad), 0, -pad.depth - TRAY_HALF[2]]),
+        np.array([1.0, 0, 0, 0]),
     )
     pose = pose_multiply(make_pose(np.array(frame.pos), np.array(frame.quat)), offset)
     frame.parent.add_geom(

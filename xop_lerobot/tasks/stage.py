@@ -166,11 +166,11 @@ class Stage:
         failed = bool(status.failure) and self._success_time is None
         if status.success and not failed and self._success_time is None:
             self._success_time = time
-        won = self._success_time is not None
         over = failed or self.time >= self.task.time_limit
-        if won:
-            over = time - self._success_time >= AFTER_SUCCESS_S
-        return dataclasses.replace(status, success=won, done=over)
+        won = self._success_time
+        if won is not None:
+            over = time - won >= AFTER_SUCCESS_S
+        return dataclasses.replace(status, success=won is not None, done=over)
 
 
 def _make_start(morphology: Morphology, task: Task) -> RobotAction:

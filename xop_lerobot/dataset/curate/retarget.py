@@ -157,7 +157,7 @@ def run(arguments: argparse.Namespace) -> int:
         config.check()
         chosen = choose_episodes(source, arguments.episodes)
         operators = Operators(source, make_step(config))
-        if arguments.dry_run:
+        if arguments.out is None or arguments.dry_run:
             show_plan(operators.read(chosen))
             return 0
         folder = RetargetFolder(arguments.out)

@@ -190,7 +190,7 @@ def _build_operator(episode: Episode) -> list[Panel]:
         pose = episode.rows.get(f"operator.{frame}")
         if pose is None:
             continue
-        known = pose[:, 3:].any(axis=1)  # zeros are no pose
+        known = np.any(pose[:, 3:], axis=1)  # zeros are no pose
         if TRACKED in episode.rows:
             known = known & episode.rows[TRACKED][:, index].astype(bool)
         curves = [
@@ -224,7 +224,7 @@ def _build_goals(episode: Episode) -> list[Panel]:
         goal, robot = (
             np.asarray(episode.rows[f"{kind}.{frame}"], float) for kind in ("goal", "robot")
         )
-        known = goal[:, 3:].any(axis=1) & np.isfinite(goal).all(axis=1)
+        known = np.any(goal[:, 3:], axis=1) & np.all(np.isfinite(goal), axis=1)
         name = frame.replace("_", " ")
         for place, axis in enumerate(_AXES):
             curves = (
@@ -286,7 +286,7 @@ def _build_cost(episode: Episode) -> list[Panel]:
     rows, names = episode.rows[_COST], _get_names(episode, _COST)
     # A term that a retargeter does not have is 0 throughout.
     places = [i for i, name in enumerate(names) if rows[:, i].any()]
-    known = rows.any(axis=1)  # before engaging there is no plan
+    known = np.any(rows, axis=1)  # before engaging there is no plan
     curves = [
         Series(names[place], _mask(rows[:, place], known), colour=number)
         for number, place in enumerate(places)

@@ -22,7 +22,7 @@ from xop_lerobot.transforms import (
     quat_rotate,
 )
 
-SIDES = ("left", "right")
+SIDES: tuple[str, str] = ("left", "right")
 OPEN, SHUT = 0.08, 0.008
 """Distance of thumb and index tip of an open hand, and in a pinch [m]."""
 PINCHES = ((0.0, 0.25), (0.45, 0.70))

@@ -60,7 +60,9 @@ def load_motion(path: Path) -> Motion:
     """
     recording = load_recording(path)
     stamps = np.arange(0, recording.duration, 1 / RATE)
-    return _make_motion(path.stem, [recording.frame_at(stamp) for stamp in stamps], simulated=False)
+    return _make_motion(
+        path.stem, [recording.frame_at(float(stamp)) for stamp in stamps], simulated=False
+    )
 
 
 def simulate_motion(seed: int, duration: float = 30.0) -> Motion:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Generator
 
@@ -117,6 +118,7 @@ def bring_beside(mind: Mind) -> Doing:
             wrists[side] = compute_wrist(mind, side, point, quat)
         mind.note("hands beside the box" if not before else "hands before the box")
         yield from reach(mind, wrists)
+        worst = math.inf
         for _ in range(tries):
             yield from mind.settle("left_palm", "right_palm")
             sides = compute_sides(mind, BESIDE + (0.03 if before else 0.0), before)
@@ -213,7 +215,7 @@ def lift(mind: Mind, rest: float) -> Generator[None, None, tuple[float, float]]:
     Returns:
         Rise of the box as seen, and of the goals of the hands [m].
     """
-    before, lifted = _see_hands(mind), 0.0
+    before, lifted, rise = _see_hands(mind), 0.0, 0.0
     for _ in range(LIFTS):
         mind.note("lift")
         step = LIFT - max(0.0, _see_hands(mind) - before)

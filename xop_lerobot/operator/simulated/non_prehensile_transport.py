@@ -203,7 +203,8 @@ def _push(mind: Mind, error: np.ndarray, gain: float) -> Doing:
     room = mind.body.compute_hands_in_room()[0]
     step = gain * mind.belief.vector_to_own(error)
     length = float(np.linalg.norm(step))
-    level = quat_multiply(compute_palm_up(mind), quat_from_rpy(*mind.miss_level(), 0))
+    roll, pitch = mind.miss_level()
+    level = quat_multiply(compute_palm_up(mind), quat_from_rpy(roll, pitch, 0))
     goal = make_pose(room[:3] + step + mind.scatter(0.3 * length), mind.belief.quat_to_own(level))
     duration = max(length / CARRY_SPEED, 0.6)
     mind.body.move(mind.body.with_hands_in_room(mind.body.posture, {"left": goal}), duration)

@@ -200,7 +200,7 @@ def _come_back(mind: Mind, own: np.ndarray, seen: np.ndarray, turn: float) -> Do
     came = quat_rotate(quat_from_yaw(-turn), head[:3] - seen[:3])
     turned = wrap_angle(compute_heading(head[3:]) - compute_heading(seen[3:]))
     target = own + np.array([came[0], came[1], float(turned)])
-    mind.body.walk(_at(mind, *target))
+    mind.body.walk(_at(mind, target))
     yield from mind.settle(patience=2.5)
 
 
@@ -232,22 +232,22 @@ def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, straight: bool, pac
         course = float(np.arctan2(way[1], way[0]))
         bend = abs(float(wrap_angle(course - body.posture.place[2])))
         if TURN_FIRST < bend:
-            body.walk(_at(mind, *body.posture.place[:2], course), pace)
+            body.walk(_at(mind, np.array([*body.posture.place[:2], course])), pace)
             yield from mind.settle(patience=1.5)
             # Turning on the spot has taken the head along; aim once more.
-        body.walk(_at(mind, *target[:2], course), pace)
+        body.walk(_at(mind, np.array([*target[:2], course])), pace)
         yield from mind.finish()
         if abs(float(wrap_angle(target[2] - course))) > TURN_FIRST:
             yield from mind.pause(mind.person.decision_s)
-    body.walk(_at(mind, *target), pace)
+    body.walk(_at(mind, target), pace)
     yield from mind.finish()
 
 
-def _at(mind: Mind, x: float, y: float, yaw: float) -> Posture:
-    """The posture at another place, turned the shorter way."""
+def _at(mind: Mind, place: np.ndarray) -> Posture:
+    """The posture at another place (x, y, yaw), turned the shorter way."""
     last = mind.body.posture
-    turn = float(wrap_angle(yaw - last.place[2]))
-    return replace(last, place=np.array([x, y, last.place[2] + turn]))
+    turn = float(wrap_angle(place[2] - last.place[2]))
+    return replace(last, place=np.array([*place[:2], last.place[2] + turn]))
 
 
 def _search(mind: Mind, names: tuple[str, ...]) -> Doing:

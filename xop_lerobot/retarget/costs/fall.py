@@ -46,7 +46,7 @@ class FallCost(Cost):
         """Which samples count as fallen at some predicted step. Shape (K,), bool."""
         base = evaluation.qpos[:, 1:, :7]
         fallen = (_compute_upright(base) < math.cos(self.tilt)) | (base[..., 2] < self.height)
-        return fallen.any(axis=1)
+        return np.any(fallen, axis=1)
 
     def compute(self, evaluation: Evaluation) -> np.ndarray:
         """Cost of every sample. Shape (K,)."""
