@@ -11,9 +11,10 @@ from xop_lerobot.command import Mode, RobotAction
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.morphology.tuning import CONTROL_REFERENCES
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.config import CONTROL_REFERENCES, RetargeterConfig
+from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.optimizer import Samples

@@ -14,6 +14,7 @@ from test_teleoperation import PINCHED, SMALL, Rig, make_frame, person, rig, sta
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.operator.gestures import DoublePinchConfig, Gesture, GestureConfig, GestureReader
 from xop_lerobot.retarget.changes import (
     WEIGHT_NAMES,
@@ -25,7 +26,7 @@ from xop_lerobot.retarget.changes import (
     parse_change,
     split_change,
 )
-from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, CostWeights, RetargeterConfig
+from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig
 from xop_lerobot.retarget.online import OnlineSettings
 from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_multiply, rotation_error

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_costs import BOX, NV, H, K, make_evaluation
 
-from xop_lerobot.retarget.config import CostWeights
+from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs import CollisionCost
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.transforms import quat_rotate

@@ -13,9 +13,10 @@ from xop_lerobot.errors import UnknownName
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
+from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan, Status
 from xop_lerobot.state import Goal

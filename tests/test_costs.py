@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from xop_lerobot.command import Mode
-from xop_lerobot.retarget.config import CostWeights
+from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs import (
     CollisionCost,
     ControlCost,

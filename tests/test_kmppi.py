@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from xop_lerobot.errors import BadValue, UnknownName
-from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
+from xop_lerobot.morphology.tuning import MpcConfig
+from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.kmppi import Kmppi, compute_effective_samples, compute_weights
 
 LOW, HIGH = np.array([-1.0, 0.2]), np.array([1.0, 0.9])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from xop_lerobot.evaluation.planner import SETTINGS, make_planner_table, measure_planners
-from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.kmppi import Kmppi
 from xop_lerobot.retarget.sampling import DRAWS
 from xop_lerobot.retarget.weighting import compute_effective_samples

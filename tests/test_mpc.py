@@ -16,10 +16,11 @@ from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.rby1 import RBY1
 from xop_lerobot.morphology.scene import add_block, add_floor, build_model
 from xop_lerobot.morphology.sensing import add_sensing
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
+from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.horizon_goals import preview
 from xop_lerobot.retarget.intervention import Intervention

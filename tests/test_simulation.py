@@ -26,7 +26,7 @@ from xop_lerobot.transforms import quat_from_rpy
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import ModelKind
-    from xop_lerobot.retarget.config import MpcConfig
+    from xop_lerobot.morphology.tuning import MpcConfig
 
 TOY = """
 <mujoco model="toy">

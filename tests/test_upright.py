@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_costs import H, K, draw_poses, make_evaluation
 
-from xop_lerobot.retarget.config import CostWeights
+from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs import UprightCost
 from xop_lerobot.retarget.costs.upright import (
     compute_side,

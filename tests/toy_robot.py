@@ -25,8 +25,9 @@ from xop_lerobot.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.operator.devices.config import DeviceConfig
-from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
+from xop_lerobot.retarget.config import RetargeterConfig
 
 MJCF = """
 <mujoco>

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.kmppi import Kmppi
 
 ENTRIES = 7

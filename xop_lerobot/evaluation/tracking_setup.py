@@ -13,7 +13,8 @@ from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
-from xop_lerobot.retarget.config import MpcConfig, RetargeterConfig
+from xop_lerobot.morphology.tuning import MpcConfig
+from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.yaml_words import load_yaml
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from xop_lerobot.command import ActionLayout, CommandSpace, Mode, RobotAction
 from xop_lerobot.morphology.effect import Effect
+from xop_lerobot.morphology.tuning import MpcConfig, PaperParameters
 from xop_lerobot.registry import Registry
-from xop_lerobot.retarget.config import MpcConfig, PaperParameters
 
 if TYPE_CHECKING:
     import mujoco

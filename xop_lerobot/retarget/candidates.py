@@ -9,8 +9,8 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.retarget.config import MpcConfig
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.kmppi import Kmppi
 from xop_lerobot.retarget.optimizer import OPTIMIZERS, Samples
 

@@ -12,13 +12,8 @@ from typing import Any
 from xop_lerobot.command import Mode
 from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.config import (
-    CONSTRAINTS,
-    PRESETS,
-    CostWeights,
-    RetargeterConfig,
-    split_names,
-)
+from xop_lerobot.morphology.tuning import CostWeights
+from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig, split_names
 
 MAX_WEIGHT = 1e6
 WEIGHT_NAMES = tuple(each.name for each in dataclasses.fields(CostWeights))

@@ -10,8 +10,8 @@ import numpy as np
 from xop_lerobot.command import Mode
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.retarget.config import MpcConfig
 from xop_lerobot.retarget.facing import FacingRule
 from xop_lerobot.retarget.footprint import Footprint
 from xop_lerobot.retarget.horizon_goals import hold_near, preview

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from xop_lerobot.errors import BadShape
-from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.optimizer import OPTIMIZERS, Samples, SamplingOptimizer
 from xop_lerobot.retarget.sampling import DRAWS
 from xop_lerobot.retarget.weighting import compute_effective_samples, compute_weights

@@ -15,9 +15,10 @@ from xop_lerobot.command import Mode
 from xop_lerobot.errors import UnknownName
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.candidates import Candidates
 from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.retarget.config import CONSTRAINTS, MpcConfig, RetargeterConfig, split_names
+from xop_lerobot.retarget.config import CONSTRAINTS, RetargeterConfig, split_names
 from xop_lerobot.retarget.costs import CollisionCost, FallCost, SupportArea, make_costs
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.decision import DecisionSpace

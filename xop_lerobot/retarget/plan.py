@@ -10,7 +10,7 @@ from enum import IntEnum
 import numpy as np
 
 from xop_lerobot.command import Mode
-from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.state import Goal, RobotState
 

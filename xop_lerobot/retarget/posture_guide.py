@@ -12,8 +12,8 @@ import numpy as np
 
 from xop_lerobot.command import Mode
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
-from xop_lerobot.retarget.config import MpcConfig
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.linearisation import Placement
 from xop_lerobot.retarget.posture import AT_REST_S, MISSED, Found, PostureSearch, Repertoire

@@ -8,14 +8,9 @@ from collections.abc import Callable
 
 from xop_lerobot.command import Mode
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.tuning import CostWeights, MpcConfig, PaperParameters
 from xop_lerobot.retarget.changes import Settings, make_settings
-from xop_lerobot.retarget.config import (
-    PRESETS,
-    CostWeights,
-    MpcConfig,
-    PaperParameters,
-    RetargeterConfig,
-)
+from xop_lerobot.retarget.config import PRESETS, RetargeterConfig
 
 _FAR = 1e6  # no goal is further away [m]
 _PAPER_WEIGHTS = CostWeights(

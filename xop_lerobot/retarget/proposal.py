@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.command import Mode
+from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.retarget.config import CostWeights
 from xop_lerobot.retarget.costs.lateral import compute_lateral
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.heading import linearise_heading

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from xop_lerobot.retarget.config import MpcConfig
+from xop_lerobot.morphology.tuning import MpcConfig
 
 _TOLERANCE = 1e-6  # of the logarithm of the effective sample size
 _LEAST_SPAN = 1e-290  # costs nearer to each other than that are the same

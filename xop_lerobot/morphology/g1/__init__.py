@@ -15,7 +15,7 @@ from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind,
 if TYPE_CHECKING:
     import mujoco
 
-    from xop_lerobot.retarget.config import MpcConfig
+    from xop_lerobot.morphology.tuning import MpcConfig
 
 ARM_JOINTS = (
     "shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow",

@@ -26,12 +26,12 @@ from xop_lerobot.morphology.rby1.mpc import (
     V2_CONFIG,
     mpc_config,
 )
-from xop_lerobot.retarget.config import PaperParameters
+from xop_lerobot.morphology.tuning import PaperParameters
 
 if TYPE_CHECKING:
     import mujoco
 
-    from xop_lerobot.retarget.config import MpcConfig
+    from xop_lerobot.morphology.tuning import MpcConfig
 
 TORSO_READY = tuple(math.radians(angle) for angle in (0, 45, -90, 45, 0, 0))
 """Torso angles at the ready pose [rad]."""

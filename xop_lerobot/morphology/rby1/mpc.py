@@ -6,7 +6,7 @@ import math
 
 from xop_lerobot.command import Mode
 from xop_lerobot.morphology.effect import Acts, Effect
-from xop_lerobot.retarget.config import CostWeights, MpcConfig
+from xop_lerobot.morphology.tuning import CostWeights, MpcConfig
 
 PIVOT = 0.228
 """The wheels' axle is this far ahead of the base frame [m]."""

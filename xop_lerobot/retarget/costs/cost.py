@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from xop_lerobot.command import Mode
-from xop_lerobot.retarget.config import CostWeights
+from xop_lerobot.morphology.tuning import CostWeights
 
 
 @dataclass(frozen=True)
