@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-from xop_lerobot.command_line import make_output_readable
+from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.evaluation.planner import make_planner_table, measure_planners
 
 

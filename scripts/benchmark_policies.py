@@ -27,9 +27,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import UnknownName, XopError
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import UnknownName, XopError
 from xop_lerobot.evaluation.tracking import run_trial
 from xop_lerobot.evaluation.tracking_setup import TrackingSetup
 from xop_lerobot.low_level.comparison import (

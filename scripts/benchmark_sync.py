@@ -17,8 +17,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.command_line import make_output_readable
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.state import RobotState
+from xop_lerobot.core.transforms import quat_yaw, wrap_angle
 from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -27,8 +29,6 @@ from xop_lerobot.plant.simulation import Simulation, SimulationConfig
 from xop_lerobot.retarget.rollout import PolicyRollout
 from xop_lerobot.retarget.state_sync import StateSync
 from xop_lerobot.retarget.sync_config import SyncConfig
-from xop_lerobot.state import RobotState
-from xop_lerobot.transforms import quat_yaw, wrap_angle
 
 TICK = 0.04  # of the teleoperator [s]
 HORIZONS = (3, 10)  # 60 and 200 ms [control steps]

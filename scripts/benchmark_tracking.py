@@ -24,8 +24,8 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import UnknownName, XopError
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import UnknownName, XopError
 from xop_lerobot.evaluation.tracking import make_record, run_scenario, run_trial
 from xop_lerobot.evaluation.tracking_documents import write_documents
 from xop_lerobot.evaluation.tracking_report import (

@@ -17,7 +17,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import (
+    compute_heading,
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_from_yaw,
+    rotation_error,
+)
 from xop_lerobot.evaluation.tracking import WorldAlignment
 from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.policy import make_policy
@@ -32,14 +40,6 @@ from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.posture import Repertoire
 from xop_lerobot.retarget.posture_guide import make_static_load
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
-from xop_lerobot.transforms import (
-    compute_heading,
-    make_pose,
-    pose_inverse,
-    pose_multiply,
-    quat_from_yaw,
-    rotation_error,
-)
 
 NEAR_M, NEAR_DEG = 0.05, 5.0
 LOWEST, MOST_TILTED = 0.5, 100.0

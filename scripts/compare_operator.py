@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import XopError
 from xop_lerobot.operator.simulated.comparison import (
     Motion,
     compute_figures,

@@ -19,8 +19,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import UnknownName, XopError
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import UnknownName, XopError
 
 ROOT = Path(__file__).resolve().parent.parent
 FPS = 25

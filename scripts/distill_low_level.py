@@ -23,9 +23,9 @@ import torch
 from low_level_teacher import ACTIONS, ARMS, GRAVITY, JOINTS, Teacher
 from torch import nn
 
-from xop_lerobot.command import Mode
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.low_level.excitation import (
     VELOCITIES,
     Excitation,

@@ -17,7 +17,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from xop_lerobot.command_line import make_output_readable
+from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.operator.devices.avp_protocol import AXES
 from xop_lerobot.operator.devices.axes import WORLD
 from xop_lerobot.operator.webxr.protocol import GRIPS, PARALLEL

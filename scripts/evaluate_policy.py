@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import BadValue, XopError
 
 if TYPE_CHECKING:
     from xop_lerobot.evaluation.policy_error import Hands

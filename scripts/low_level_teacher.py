@@ -16,13 +16,13 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import quat_rotate, quat_yaw
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.low_level.tables import load_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.transforms import quat_rotate, quat_yaw
 
 JOINTS = read_joints("g1")
 ARMS = slice(JOINTS.arms[0], JOINTS.arms[-1] + 1)

@@ -32,8 +32,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from tqdm import tqdm
 
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
 
 if TYPE_CHECKING:

@@ -18,8 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.transforms import make_pose
 from xop_lerobot.operator.clutch import Clutch
 from xop_lerobot.operator.clutch import Wish as ClutchWish
 from xop_lerobot.operator.dataset_recording import is_dataset, load_dataset_recording
@@ -28,7 +29,6 @@ from xop_lerobot.operator.gestures import GestureConfig
 from xop_lerobot.operator.hands import Hands
 from xop_lerobot.operator.recording import Recording, load_recording
 from xop_lerobot.operator.simulated.comparison import simulate_frames
-from xop_lerobot.transforms import make_pose
 
 RATE = 50
 """Rate of the streams [Hz]."""

@@ -11,6 +11,7 @@ import grpc
 import numpy as np
 from ports import find_port
 
+from xop_lerobot.core.transforms import quat_rotate
 from xop_lerobot.operator.devices.avp_protocol import (
     AXES,
     ENTRIES,
@@ -21,7 +22,6 @@ from xop_lerobot.operator.devices.avp_protocol import (
     HandUpdate,
 )
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.transforms import quat_rotate
 
 SIDES = ("left", "right")
 NUM_JOINTS = 27

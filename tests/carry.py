@@ -6,21 +6,21 @@ import math
 
 import numpy as np
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.low_level.policy import make_policy
-from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.plant.policy_loop import PolicyLoop
-from xop_lerobot.retarget.arm_driver import ArmDriver
-from xop_lerobot.state import Goal
-from xop_lerobot.tasks.palm import PALM_UP
-from xop_lerobot.tasks.stage import Stage
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
     quat_from_rpy,
     quat_multiply,
 )
+from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.retarget.arm_driver import ArmDriver
+from xop_lerobot.tasks.palm import PALM_UP
+from xop_lerobot.tasks.stage import Stage
 
 DT = 0.02
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.operator.clutch import Clutch
 from xop_lerobot.operator.clutch import Wish as ClutchWish
 from xop_lerobot.operator.devices.config import DeviceConfig

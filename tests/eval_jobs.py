@@ -3,7 +3,7 @@
 import os
 import signal
 
-from xop_lerobot.pool import THREAD_VARIABLES
+from xop_lerobot.core.pool import THREAD_VARIABLES
 
 
 def do(job):

@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_rotate
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.retarget.arm_driver import ArmDriver
-from xop_lerobot.state import Goal
 from xop_lerobot.tasks import furniture
 from xop_lerobot.tasks.box_pick_and_place import BOX, SPOT, SUPPORT
 from xop_lerobot.tasks.stage import Stage
-from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_rotate
 
 DT = 0.02
 NO_TURN = np.array([1.0, 0, 0, 0])

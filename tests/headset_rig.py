@@ -13,7 +13,8 @@ from typing import TypeVar
 import numpy as np
 from avp_server import wait_for
 
-from xop_lerobot.command import RobotAction
+from xop_lerobot.core.command import RobotAction
+from xop_lerobot.core.transforms import make_pose, quat_exp, quat_multiply
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
@@ -25,7 +26,6 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
-from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
 FPS, RATE = 25, 50

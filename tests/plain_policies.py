@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.low_level.joints import read_joints
 
 Network = Callable[..., np.ndarray]

@@ -6,8 +6,8 @@ import mink
 import mujoco
 import numpy as np
 
+from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.transforms import quat_from_yaw
 
 HEIGHTS = {"g1": (0.78, 0.65, 0.53, 0.42)}
 """Base heights that a robot's policy reaches [m]; others stay at their own."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from xop_lerobot.core.transforms import make_pose, quat_exp
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.transforms import make_pose, quat_exp
 
 
 def make_person(t: float) -> OperatorFrame:

@@ -7,19 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xop_lerobot.errors import BadValue, UnknownName
-from xop_lerobot.operator.alignment import (
-    Alignment,
-    AlignmentConfig,
-    EngageRefused,
-    NotEngaged,
-    is_lost,
-)
-from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.goal_velocity import GoalVelocity, GoalVelocityConfig
-from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import (
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -30,6 +20,16 @@ from xop_lerobot.transforms import (
     quat_rotate,
     rotation_error,
 )
+from xop_lerobot.operator.alignment import (
+    Alignment,
+    AlignmentConfig,
+    EngageRefused,
+    NotEngaged,
+    is_lost,
+)
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.goal_velocity import GoalVelocity, GoalVelocityConfig
+from xop_lerobot.operator.interpolation import compute_heading
 
 ROBOT_HEIGHT = 1.27
 angles = st.floats(-3.0, 3.0)

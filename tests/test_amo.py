@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import PolicyFileError
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import PolicyFileError
+from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.transforms import quat_from_yaw
 
 FILES = ("amo_jit.pt", "adapter_jit.pt", "adapter_norm_stats.pt")
 SEEN = [*range(19), *range(22, 26)]

@@ -6,17 +6,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.morphology.morphology import Morphology, make_morphology
-from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.arm_ik import ArmIk, _find_pairs
-from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.transforms import (
+from xop_lerobot.core.transforms import (
     make_pose,
     quat_exp,
     quat_from_rpy,
     quat_multiply,
     rotation_error,
 )
+from xop_lerobot.morphology.morphology import Morphology, make_morphology
+from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.retarget.arm_ik import ArmIk, _find_pairs
+from xop_lerobot.retarget.kinematics import SiteKinematics
 
 DT = 0.04
 MAX_SPEED = 3.0

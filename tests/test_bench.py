@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.state import RobotState
 from xop_lerobot.evaluation import bench
 from xop_lerobot.evaluation.bench import (
     BareRollout,
@@ -22,7 +23,6 @@ from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.rollout import PolicyRollout
-from xop_lerobot.state import RobotState
 
 CONTRACT = {
     "step_ms_median", "step_ms_p99", "rollout_ms_median", "physics_ms_median",

@@ -13,7 +13,8 @@ from test_lerobot_cli import run
 from toy_robot import make_toy
 
 from lerobot_teleoperator_xop import Xop, XopConfig
-from xop_lerobot.errors import BadValue, NotConnected, XopError
+from xop_lerobot.core.errors import BadValue, NotConnected, XopError
+from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_rotate
 from xop_lerobot.link import get_session
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.reach import compute_forward_reach
@@ -33,7 +34,6 @@ from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.operator.display import Display
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_rotate
 
 RATE = 50
 EYES, REACH = 1.63, 0.58

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.state import Goal
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -20,7 +21,6 @@ from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.optimizer import Samples
 from xop_lerobot.retarget.plan import Plan
 from xop_lerobot.retarget.proposal import pace
-from xop_lerobot.state import Goal
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
 robots = pytest.mark.parametrize("name", list(POLICIES))

@@ -11,8 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_teleoperation import PINCHED, SMALL, Rig, make_frame, person, rig, stand  # noqa: F401
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_multiply, rotation_error
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.operator.gestures import DoublePinchConfig, Gesture, GestureConfig, GestureReader
@@ -29,7 +30,6 @@ from xop_lerobot.retarget.changes import (
 from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig
 from xop_lerobot.retarget.online import OnlineSettings
 from xop_lerobot.retarget.presets import build_configs
-from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_multiply, rotation_error
 
 OPEN = np.full(2, 0.08)
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import make_pose, quat_exp, quat_multiply
 from xop_lerobot.operator.clutch import Clutch, ClutchConfig, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.hand_blend import HandBlend
 from xop_lerobot.operator.recording import load_recording
-from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[2] / "shared"))
 UP = quat_exp(np.array([np.pi, 0, 0]))

@@ -21,6 +21,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 import xop_lerobot.dataset.collect_folder as folder_module
+from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.dataset.collect import collect, main, make_parser, parse_arguments
 from xop_lerobot.dataset.collect_config import CollectConfig
 from xop_lerobot.dataset.collect_folder import CollectFolder, FolderTaken, OtherSettings
@@ -28,7 +29,6 @@ from xop_lerobot.dataset.collect_jobs import WorkerFailed
 from xop_lerobot.dataset.collect_merge import merge_attempts
 from xop_lerobot.dataset.collect_worker import Collector
 from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.errors import BadValue, UnknownName, XopError
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 
 REPO = Path(__file__).parents[1]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from test_costs import BOX, NV, H, K, make_evaluation
 
+from xop_lerobot.core.transforms import quat_rotate
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs import CollisionCost
 from xop_lerobot.retarget.obstacles import Obstacle
-from xop_lerobot.transforms import quat_rotate
 
 WALL = Obstacle("wall", np.array([0.0, 2, 0]), np.array([1.0, 0, 0, 0]), np.array([3.0, 0.1, 3]))
 POST = Obstacle(

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from xop_lerobot.command import (
+from xop_lerobot.core.command import (
     MODE_KEY,
     ActionLayout,
     CommandDim,
@@ -16,7 +16,7 @@ from xop_lerobot.command import (
     RobotAction,
     check_vector,
 )
-from xop_lerobot.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 
 SPACE = CommandSpace(
     (

@@ -8,8 +8,9 @@ import threading
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.errors import UnknownName
+from xop_lerobot.core.state import Goal
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -19,7 +20,6 @@ from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan, Status
-from xop_lerobot.state import Goal
 
 DT = 0.04
 

@@ -18,7 +18,7 @@ from xop_lerobot.control.client import ControlClient, NoSession, Refused
 from xop_lerobot.control.keys import PRESET_KEYS, TOGGLE_KEYS, press
 from xop_lerobot.control.protocol import MAX_LINE, find_runtime_dir, find_socket
 from xop_lerobot.control.server import ControlFault, ControlServer
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.retarget.changes import make_toggle, parse_change
 from xop_lerobot.retarget.config import RetargeterConfig

@@ -9,7 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import (
+    heading_error,
+    make_pose,
+    quat_exp,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    quat_yaw,
+)
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs import (
     CollisionCost,
@@ -26,16 +36,6 @@ from xop_lerobot.retarget.costs import (
 )
 from xop_lerobot.retarget.costs.lateral import compute_facing
 from xop_lerobot.retarget.obstacles import Obstacle
-from xop_lerobot.transforms import (
-    heading_error,
-    make_pose,
-    quat_exp,
-    quat_from_rpy,
-    quat_from_yaw,
-    quat_multiply,
-    quat_rotate,
-    quat_yaw,
-)
 
 K, H, NQ, NV, NA = 5, 4, 9, 8, 3
 SITES = ("a", "b", "c")

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from xop_lerobot.core.errors import XopError
 from xop_lerobot.dataset.collect_folder import FolderTaken
 from xop_lerobot.dataset.curate import destination as module
 from xop_lerobot.dataset.curate.destination import Destination
-from xop_lerobot.errors import XopError
 
 REPO = Path(__file__).parents[1]
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.dataset.curate.expression import Expression, Kind
-from xop_lerobot.errors import BadValue, UnknownName, XopError
 
 KINDS = {
     "success": Kind.FLAG,

@@ -16,6 +16,7 @@ import pytest
 from curate_data import compute_digests, make_foreign, make_synthetic, rewrite
 from lerobot.datasets import LeRobotDataset
 
+from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.columns import HEALTH_NAMES
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.expression import Expression
@@ -23,7 +24,6 @@ from xop_lerobot.dataset.curate.figures import FIGURES
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.curate.survey import survey
 from xop_lerobot.dataset.facts import EPISODES_FILE, read_facts
-from xop_lerobot.errors import BadDataset
 
 REPO = Path(__file__).parents[1]
 EPISODES = 6

@@ -11,6 +11,7 @@ import pytest
 from curate_data import compute_digests, make_foreign, make_synthetic
 from curate_recorded import load, read_rows, record_toy
 
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.frame_rules import FrameRules, list_entries
 from xop_lerobot.dataset.curate.label_session import LabelSession
@@ -25,7 +26,6 @@ from xop_lerobot.dataset.curate.labels import (
 )
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.errors import BadValue, UnknownName
 
 EPISODES, FRAMES, FPS = 4, 60, 25
 

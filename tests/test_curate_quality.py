@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from xop_lerobot.core.errors import BadShape
+from xop_lerobot.core.transforms import pose_multiply, quat_exp
 from xop_lerobot.dataset import quality
-from xop_lerobot.errors import BadShape
-from xop_lerobot.transforms import pose_multiply, quat_exp
 
 DT = 0.04
 

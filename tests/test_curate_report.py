@@ -15,6 +15,7 @@ import pytest
 from browser import open_page
 from curate_data import compute_digests, make_foreign, make_synthetic, rewrite
 
+from xop_lerobot.core.page import dump_script
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.figures import FIGURES
 from xop_lerobot.dataset.curate.report_episode import Limits
@@ -23,7 +24,6 @@ from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.curate.survey import survey
 from xop_lerobot.dataset.curate.traces import decode, encode, thin
 from xop_lerobot.dataset.facts import EPISODES_FILE
-from xop_lerobot.page import dump_script
 
 EPISODES, FRAMES = 6, 100
 EVIL = "</script><img src=x onerror=\"document.title='evil'\">"

@@ -18,6 +18,8 @@ import toy_robot  # noqa: F401  registers the robot
 from hardware_like import make_hardware_like
 
 import xop_lerobot.dataset.collect_run as run_module
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.dataset.collect_merge import merge_attempts
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.retarget import RetargetFolder
@@ -30,11 +32,9 @@ from xop_lerobot.dataset.curate.retarget_config import (
 from xop_lerobot.dataset.curate.retarget_source import RetargetJob, parse_episodes
 from xop_lerobot.dataset.curate.retarget_worker import Retargeter
 from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.recording import Recording, load_recording, make_recording
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.state import FRAMES
 
 REPO = Path(__file__).parents[1]
 SHARED = Path(os.environ.get("XOP_SHARED", REPO.parent / "shared"))

@@ -12,9 +12,9 @@ import pytest
 from curate_data import make_foreign, make_synthetic
 from lerobot.datasets import LeRobotDataset
 
+from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.task_words import TASKS_FILE, has_index_of_words, read_tasks
-from xop_lerobot.errors import BadDataset
 
 WORDS = ["task 0", "task 1"]
 NUMBERS = pa.array([0, 1])

@@ -27,6 +27,7 @@ from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from PIL import Image
 from toy_robot import make_teleop, make_toy
 
+from xop_lerobot.core.errors import BadDataset, BadShape, BadValue
 from xop_lerobot.dataset.curate.cli import main
 from xop_lerobot.dataset.curate.clip import Clip, Step, cut_changes
 from xop_lerobot.dataset.curate.pictures import VideoIndex
@@ -34,7 +35,6 @@ from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.curate.transfer import NothingLeft, transfer
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.dataset.xop_dataset import XopDataset
-from xop_lerobot.errors import BadDataset, BadShape, BadValue
 
 HEAD = "observation.images.head"
 COUNTED = ["timestamp", "frame_index", "episode_index", "index"]

@@ -25,7 +25,9 @@ from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame, dataset_to_policy_features
 from toy_robot import make_teleop, make_toy
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, LinkError, XopError
+from xop_lerobot.core.state import FRAMES, Goal
 from xop_lerobot.dataset import durability, embedding
 from xop_lerobot.dataset.columns import COST_NAMES, HEALTH_NAMES, Columns
 from xop_lerobot.dataset.executed import put_executed
@@ -39,10 +41,8 @@ from xop_lerobot.dataset.xop_dataset import (
     WrongFps,
     XopDataset,
 )
-from xop_lerobot.errors import BadValue, LinkError, XopError
 from xop_lerobot.link import Executed, Outcome, TickRecord, get_session
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.state import FRAMES, Goal
 
 REPO = Path(__file__).parents[1]
 POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]

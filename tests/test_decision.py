@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model

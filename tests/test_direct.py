@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
-from xop_lerobot.low_level.policy import make_policy
-from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.plant.policy_loop import PolicyLoop
-from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.direct import DirectRetargeter
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import (
     make_pose,
     quat_from_rpy,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
 )
+from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.direct import DirectRetargeter
 
 
 @pytest.fixture(scope="module", params=["g1", "rby1"])

@@ -20,6 +20,7 @@ from ports import find_port
 from websockets.exceptions import ConnectionClosed
 from webxr_client import Page
 
+from xop_lerobot.core.transforms import make_pose, quat_exp
 from xop_lerobot.doctor import cli, cpu, disk, interpreter, plugin
 from xop_lerobot.doctor.certificate import check_certificate
 from xop_lerobot.doctor.child import Answer, run_child
@@ -33,7 +34,6 @@ from xop_lerobot.doctor.ports import check_ports
 from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.certificate import get_certificate
-from xop_lerobot.transforms import make_pose, quat_exp
 
 
 def test_interpreter(monkeypatch):

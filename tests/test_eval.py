@@ -8,7 +8,8 @@ import time
 import pytest
 from eval_jobs import do, make_trial, run_made
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.pool import THREAD_VARIABLES, run_jobs
 from xop_lerobot.evaluation import study
 from xop_lerobot.evaluation.eval_cli import main
 from xop_lerobot.evaluation.methods import (
@@ -30,7 +31,6 @@ from xop_lerobot.evaluation.study import (
 from xop_lerobot.evaluation.study_file import load_study
 from xop_lerobot.evaluation.trial import TrialSetup
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.pool import THREAD_VARIABLES, run_jobs
 
 CONTRACT = (
     "robot", "task", "method", "variant", "trials", "success", "pickup", "collision", "falls",

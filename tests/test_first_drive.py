@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from test_teleoperation import OPEN, Person, Rig, robots
 
+from xop_lerobot.core.transforms import make_pose, quat_from_rpy
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.transforms import make_pose, quat_from_rpy
 
 HEAD = np.array([0.0, 0.0, 1.7])
 REST = (0.3, 0.2, -0.5)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import DoublePinchConfig, DoublePinchDetector, grip_from_pinch

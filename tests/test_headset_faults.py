@@ -14,11 +14,11 @@ import pytest
 from avp_server import AvpServer
 from headset_rig import POLICIES, RATE, Fault, Rig
 
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_yaw
 from xop_lerobot.operator.clutch import Clutch, Wish
 from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import make_pose, pose_multiply, quat_from_yaw
 
 
 @pytest.fixture

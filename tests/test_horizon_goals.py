@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from xop_lerobot.command import Mode
-from xop_lerobot.retarget.horizon_goals import hold_level, hold_near, preview
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import (
     make_pose,
     quat_exp,
     quat_from_rpy,
@@ -19,6 +18,7 @@ from xop_lerobot.transforms import (
     quat_rotate,
     rotation_error,
 )
+from xop_lerobot.retarget.horizon_goals import hold_level, hold_near, preview
 
 HERE = make_pose(np.array([1.0, 2.0, 1.4]), quat_from_yaw(0.3))
 

@@ -25,11 +25,11 @@ from lerobot.utils.keyboard_input import apply_recording_control
 from test_dataset import STREAMING, tick
 from toy_robot import SMALL, XopToyConfig, make_teleop, make_toy
 
+from xop_lerobot.core.errors import BadValue, LinkError
 from xop_lerobot.dataset import host, rollout_loop
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.dataset.record import build_features
 from xop_lerobot.dataset.xop_dataset import DatasetExists, WrongFps, XopDataset
-from xop_lerobot.errors import BadValue, LinkError
 
 STOCK_DATASET, STOCK_LOOP = LeRobotDataset, record_module.record_loop
 

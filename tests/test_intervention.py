@@ -8,7 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import quat_from_rpy
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -20,8 +22,6 @@ from xop_lerobot.retarget.intervention import Intervention, Verdict, judge
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Plan, Status
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import quat_from_rpy
 
 NAN = np.nan
 NONE = [False] * 4

@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import make_pose, quat_exp
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.transforms import make_pose, quat_exp
 
 MIXED = """
 <mujoco>

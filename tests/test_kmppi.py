@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.kmppi import Kmppi, compute_effective_samples, compute_weights

@@ -21,12 +21,12 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.scripts.lerobot_record import RecordConfig
 from lerobot.utils.keyboard_input import apply_recording_control
 
-from xop_lerobot.command import Mode
 from xop_lerobot.control.client import ControlClient
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.dataset.record import XopRecordConfig
 from xop_lerobot.dataset.xop_dataset import XopDataset
-from xop_lerobot.errors import BadValue, XopError
 from xop_lerobot.link import get_session
 
 REPO = Path(__file__).parents[1]

@@ -13,8 +13,14 @@ import numpy as np
 import pytest
 import requests
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadShape, BadValue, PolicyFileError, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadShape, BadValue, PolicyFileError, UnknownName
+from xop_lerobot.core.transforms import (
+    compute_projected_gravity,
+    quat_conjugate,
+    quat_rotate,
+    quat_to_rpy,
+)
 from xop_lerobot.low_level import policy_file
 from xop_lerobot.low_level.comparison import make_simulation
 from xop_lerobot.low_level.diff_drive import DiffDrive, compute_wheel_speeds
@@ -26,12 +32,6 @@ from xop_lerobot.low_level.tables import find_table, load_policy, read_table
 from xop_lerobot.low_level.trial import BatchSimulation, run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.transforms import (
-    compute_projected_gravity,
-    quat_conjugate,
-    quat_rotate,
-    quat_to_rpy,
-)
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[1] / ".." / "shared"))
 FALCON_FILE = read_table(find_table("falcon")).networks["whole_body"].file

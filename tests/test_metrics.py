@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from xop_lerobot.errors import BadShape, BadValue
+from xop_lerobot.core.errors import BadShape, BadValue
+from xop_lerobot.core.transforms import make_pose, quat_exp, quat_from_yaw, quat_multiply
 from xop_lerobot.evaluation.intervals import compute_mean_interval, compute_rate_interval
 from xop_lerobot.evaluation.metrics import (
     compute_balance_power,
@@ -19,7 +20,6 @@ from xop_lerobot.evaluation.metrics import (
     compute_tracking_error,
     find_runs,
 )
-from xop_lerobot.transforms import make_pose, quat_exp, quat_from_yaw, quat_multiply
 
 DT = 0.04
 

@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import UnknownName
+from xop_lerobot.core.transforms import quat_to_rpy, quat_yaw
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, Morphology, make_morphology
 from xop_lerobot.morphology.scene import SCENES, build_model
-from xop_lerobot.transforms import quat_to_rpy, quat_yaw
 
 ROBOTS = ("g1", "rby1")
 KINDS = ("full", "planning")

@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from xop_lerobot.core.transforms import quat_exp, quat_from_rpy, quat_multiply, quat_rotate
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.rby1.links import PLACEHOLDER
-from xop_lerobot.transforms import quat_exp, quat_from_rpy, quat_multiply, quat_rotate
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[2] / "shared"))
 G1_XML = SHARED / "reference" / "g1" / "g1_29dof_kinematics.xml"

@@ -9,8 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.errors import UnknownName
+from xop_lerobot.core.state import Goal, RobotState
+from xop_lerobot.core.transforms import quat_from_yaw, quat_multiply, quat_rotate, rotation_error
 from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.rby1 import RBY1
@@ -27,8 +29,6 @@ from xop_lerobot.retarget.intervention import Intervention
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan, Status
-from xop_lerobot.state import Goal, RobotState
-from xop_lerobot.transforms import quat_from_yaw, quat_multiply, quat_rotate, rotation_error
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
 SMALL = RetargeterConfig(num_samples=8, horizon=4, threads=1)

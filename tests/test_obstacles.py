@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from lerobot_robot_xop import XopG1, XopG1Config
 from lerobot_teleoperator_xop import Xop, XopConfig
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import quat_exp, quat_from_rpy, quat_rotate
 from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
@@ -22,7 +23,6 @@ from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.obstacle_file import BadObstacles, load_obstacles
 from xop_lerobot.retarget.obstacles import SHAPES, Obstacle, ObstacleSet, make_obstacles
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
-from xop_lerobot.transforms import quat_exp, quat_from_rpy, quat_rotate
 
 BOX = Obstacle(
     "box", np.array([0.5, -0.2, 0.4]), quat_from_rpy(0.2, 0.4, 0.9), np.array([0.3, 0.1, 0.2])

@@ -7,7 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import quat_from_rpy, quat_multiply, rotation_error
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -17,8 +19,6 @@ from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.offset import OffsetObserver
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import quat_from_rpy, quat_multiply, rotation_error
 
 DT = 0.04
 

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import make_pose, quat_exp, quat_log, quat_multiply
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.one_euro import (
     OneEuro,
@@ -21,7 +22,6 @@ from xop_lerobot.operator.one_euro import (
     make_one_euro,
 )
 from xop_lerobot.operator.recording import load_recording
-from xop_lerobot.transforms import make_pose, quat_exp, quat_log, quat_multiply
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[2] / "shared"))
 RATE = 72

@@ -8,8 +8,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadRecording
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadRecording
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.operator.dataset_recording import (
     COLUMNS,
     choose_columns,
@@ -18,7 +19,6 @@ from xop_lerobot.operator.dataset_recording import (
 )
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.row_clock import read_row_clock
-from xop_lerobot.state import FRAMES
 
 FPS = 25
 LENGTH = 20

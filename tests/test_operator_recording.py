@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadRecording, BadValue, NotConnected, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadRecording, BadValue, NotConnected, UnknownName
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.operator.devices import DEVICES, DeviceConfig, make_device
 from xop_lerobot.operator.recording import load_recording
-from xop_lerobot.state import FRAMES
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[2] / "shared"))
 POSES = [f"{frame}_pose" for frame in FRAMES]

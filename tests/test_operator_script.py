@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import quat_from_rpy, quat_rotate, rotation_error
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.interpolation import compute_minimum_jerk
 from xop_lerobot.operator.noise import HEAD_SWAY, TREMOR, TREMOR_BAND, BandNoise, HumanNoise
 from xop_lerobot.operator.script import BadScript, Script, list_scripts, load_script, make_script
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import quat_from_rpy, quat_rotate, rotation_error
 
 DT = 0.01
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import ndtr
 from scipy.stats import kstest
 
-from xop_lerobot.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 from xop_lerobot.morphology.tuning import KERNEL_MEANS, SAMPLINGS, MpcConfig
 from xop_lerobot.retarget.cem import Cem
 from xop_lerobot.retarget.kmppi import Kmppi

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from curate_data import make_synthetic, rewrite
 
-from xop_lerobot.command_line import can_print_anything, make_output_readable
+from xop_lerobot.core.command_line import can_print_anything, make_output_readable
 from xop_lerobot.dataset.curate import cli as curate
 from xop_lerobot.dataset.curate.task_words import TASKS_FILE
 from xop_lerobot.dataset.curate.verbs import VERBS

@@ -19,8 +19,8 @@ from lerobot.teleoperators.utils import make_teleoperator_from_config
 from toy_robot import ARM_JOINTS, SMALL, XopToy, XopToyConfig, make_teleop, make_toy
 
 from lerobot_robot_xop import LowLevelConfig, SceneConfig, XopG1, XopG1Config, XopRby1Config
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadRecording, BadValue, LinkError, NotConnected, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadRecording, BadValue, LinkError, NotConnected, UnknownName
 from xop_lerobot.link import get_session
 
 REPO = Path(__file__).parents[1]

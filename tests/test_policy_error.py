@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from reached import collect_reach
 
+from xop_lerobot.core.errors import BadDataset, BadValue
 from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.errors import BadDataset, BadValue
 from xop_lerobot.evaluation.policy_error import (
     Hands,
     Setting,

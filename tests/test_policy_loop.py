@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.errors import BadShape, BadValue
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.errors import BadShape, BadValue
 from xop_lerobot.low_level.diff_drive import DiffDrive
 from xop_lerobot.low_level.policy import (
     POLICY_DT,

@@ -17,8 +17,8 @@ import toy_networks
 
 from lerobot_robot_xop import XopG1, XopG1Config
 from lerobot_robot_xop.config_xop import LowLevelConfig
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import PolicyFileError
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import PolicyFileError
 from xop_lerobot.low_level import tables
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.network_policy import MotorSet, NetworkPolicy, convert_targets

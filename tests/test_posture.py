@@ -9,7 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal, RobotState
+from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_from_yaw, rotation_error
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -18,8 +20,6 @@ from xop_lerobot.retarget.linearisation import Placement
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.posture import AT_REST_S
 from xop_lerobot.retarget.static_load import StaticLoad
-from xop_lerobot.state import Goal, RobotState
-from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_from_yaw, rotation_error
 
 ROBOTS = ("g1", "rby1")
 robots = pytest.mark.parametrize("name", ROBOTS)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_teleoperation import Person, Rig, make_frame
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.retarget.config import RetargeterConfig
 

@@ -10,7 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal, RobotState
+from xop_lerobot.core.transforms import (
+    heading_error,
+    quat_exp,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    quat_yaw,
+    rotation_error,
+)
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
@@ -23,16 +33,6 @@ from xop_lerobot.retarget.heading import linearise_heading
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.linearisation import Placement
 from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
-from xop_lerobot.state import Goal, RobotState
-from xop_lerobot.transforms import (
-    heading_error,
-    quat_exp,
-    quat_from_yaw,
-    quat_multiply,
-    quat_rotate,
-    quat_yaw,
-    rotation_error,
-)
 
 ROBOTS = ("g1", "rby1")
 DT = 0.6

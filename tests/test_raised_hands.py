@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import (
+    make_pose,
+    quat_exp,
+    quat_from_rpy,
+    quat_multiply,
+    quat_rotate,
+)
 from xop_lerobot.operator.clutch import Clutch
 from xop_lerobot.operator.clutch import Wish as ClutchWish
 from xop_lerobot.operator.display import Wish
@@ -20,7 +27,6 @@ from xop_lerobot.operator.hands import Hands, explain_gestures
 from xop_lerobot.operator.raised_hands import RaisedHands, RaisedHandsConfig
 from xop_lerobot.operator.recording import load_recording
 from xop_lerobot.operator.simulated.comparison import simulate_frames
-from xop_lerobot.transforms import make_pose, quat_exp, quat_from_rpy, quat_multiply, quat_rotate
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[2] / "shared"))
 RATE = 50

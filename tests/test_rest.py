@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import compute_projected_gravity, quat_exp, quat_from_yaw
 from xop_lerobot.low_level.comparison import make_simulation, measure_rest
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.low_level.rest import RestMap
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.transforms import compute_projected_gravity, quat_exp, quat_from_yaw
 
 HEIGHTS, PITCHES = [0.4, 0.5, 0.6, 0.8], [-0.5, 0.0, 0.4]
 HEIGHT, PITCH = 0, 3

@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.state import RobotState
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -15,7 +16,6 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
-from xop_lerobot.state import RobotState
 
 ROBOTS = {"g1": "default", "rby1": "diff_drive"}
 robots = pytest.mark.parametrize("name", list(ROBOTS))

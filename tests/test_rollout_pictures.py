@@ -12,8 +12,8 @@ from lerobot.scripts import lerobot_rollout
 from test_host import ForeignRobotConfig
 from toy_robot import XopToyConfig
 
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.dataset.rollout_pictures import watch_rollouts
-from xop_lerobot.errors import BadValue
 
 TEXT = (
     "policy was trained with pictures of 128 x 96 of camera 'head', and the robot's are 320 x 240"

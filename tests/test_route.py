@@ -7,7 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import (
+    make_pose,
+    pose_multiply,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_yaw,
+)
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.footprint import Footprint
@@ -16,14 +24,6 @@ from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.route import RoutePlanner
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import (
-    make_pose,
-    pose_multiply,
-    quat_from_rpy,
-    quat_from_yaw,
-    quat_yaw,
-)
 
 RESTING = 0.03  # how far the head is ahead of the base [m]
 LEAN = 0.1  # what is left to the torso [m]

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model

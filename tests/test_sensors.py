@@ -9,7 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import (
+    quat_conjugate,
+    quat_from_rpy,
+    quat_log,
+    quat_multiply,
+    quat_yaw,
+)
 from xop_lerobot.plant.config import (
     NOISE_PRESETS,
     NoiseConfig,
@@ -17,7 +24,6 @@ from xop_lerobot.plant.config import (
     compute_num_steps,
 )
 from xop_lerobot.plant.sensors import Sensors
-from xop_lerobot.transforms import quat_conjugate, quat_from_rpy, quat_log, quat_multiply, quat_yaw
 
 TIME_STEP = 0.005
 ROBOT = """

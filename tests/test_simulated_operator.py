@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from toy_world import DT, ToyWorld, make_body
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import make_pose, quat_log, quat_multiply, quat_yaw
+from xop_lerobot.core.transforms import quat_conjugate as conjugate
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.devices.simulated import SimulatedDevice
 from xop_lerobot.operator.noise import HumanNoise
@@ -18,8 +20,6 @@ from xop_lerobot.operator.simulated.intentions import INTENTIONS
 from xop_lerobot.operator.simulated.perception import Perception
 from xop_lerobot.operator.simulated.person import Person, draw_person
 from xop_lerobot.operator.view import SeenObject, View
-from xop_lerobot.transforms import make_pose, quat_log, quat_multiply, quat_yaw
-from xop_lerobot.transforms import quat_conjugate as conjugate
 
 UNIT = np.array([1.0, 0, 0, 0])
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from ports import find_port
 
-from xop_lerobot.command import CommandDim, CommandSpace, Mode
-from xop_lerobot.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.transforms import quat_from_rpy
 from xop_lerobot.morphology.morphology import ArmChain, Morphology, make_morphology
 from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
 from xop_lerobot.plant.gl import RenderingUnavailable, choose_backends, make_gl_context
 from xop_lerobot.plant.plant import Plant
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.transforms import quat_from_rpy
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import ModelKind

@@ -10,8 +10,9 @@ from toy_robot import make_teleop, make_toy
 
 from lerobot_robot_xop import XopG1Config, XopRby1, XopRby1Config
 from lerobot_teleoperator_xop import Xop, XopConfig
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import UnknownName
+from xop_lerobot.core.state import Goal
 from xop_lerobot.link import get_session
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
@@ -23,7 +24,6 @@ from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Retargeter
-from xop_lerobot.state import Goal
 from xop_lerobot.tasks.dual_point_touch import TOLERANCE
 from xop_lerobot.tasks.furniture import place
 from xop_lerobot.tasks.stage import Stage

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import toy_robot
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import quat_exp, quat_multiply, quat_yaw, wrap_angle
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -19,7 +20,6 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation, SimulationConfig
 from xop_lerobot.retarget.state_sync import StateSync
 from xop_lerobot.retarget.sync_config import SyncConfig, SyncStatus
-from xop_lerobot.transforms import quat_exp, quat_multiply, quat_yaw, wrap_angle
 
 ROBOTS = ("g1", "rby1", "toy")
 DT = 0.04

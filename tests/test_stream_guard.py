@@ -10,12 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xop_lerobot.errors import BadValue
-from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_minimum_jerk
-from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import (
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -23,6 +20,9 @@ from xop_lerobot.transforms import (
     quat_from_yaw,
     quat_multiply,
 )
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_minimum_jerk
+from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
 
 DT = 1 / 100
 

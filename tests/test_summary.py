@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from xop_lerobot.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 from xop_lerobot.evaluation import strip, summary
 
 FPS = 25

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import toy_robot
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.sync_config import SyncConfig

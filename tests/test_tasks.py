@@ -8,6 +8,7 @@ import pytest
 from grasp import Grasp
 from reachability import find_posture
 
+from xop_lerobot.core.transforms import make_pose, quat_from_rpy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.tasks import box_pick_and_place as box_task
 from xop_lerobot.tasks import dual_point_touch as touch
@@ -21,7 +22,6 @@ from xop_lerobot.tasks.layout import (
 )
 from xop_lerobot.tasks.stage import Stage
 from xop_lerobot.tasks.touching import Touching, compute_tilt
-from xop_lerobot.transforms import make_pose, quat_from_rpy
 
 ROBOTS = ("g1", "rby1")
 

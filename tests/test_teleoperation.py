@@ -11,7 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.state import FRAMES, Goal, RobotState
+from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_from_yaw, quat_rotate
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
@@ -26,9 +28,7 @@ from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Plan, Retargeter
-from xop_lerobot.state import FRAMES, Goal, RobotState
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
-from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_from_yaw, quat_rotate
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
 SMALL = RetargeterConfig(num_samples=6, horizon=4, threads=1)

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from test_teleoperation import Person, Rig, make_frame
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.paced_log import PacedLog
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.operator.devices.live import LiveDevice
 from xop_lerobot.operator.display import Cue, NoticeBoard
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.telling import describe_settings, list_warnings, tell_changes
-from xop_lerobot.paced_log import PacedLog
 from xop_lerobot.retarget.changes import Change
 from xop_lerobot.retarget.online import AppliedChange
 

@@ -6,8 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.transforms import (
+    make_pose,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_rotate,
+    quat_yaw,
+)
 from xop_lerobot.evaluation.tracking_metrics import (
     Trajectory,
     compute_errors,
@@ -41,7 +48,6 @@ from xop_lerobot.evaluation.tracking_setup import (
 )
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.transforms import make_pose, quat_from_rpy, quat_from_yaw, quat_rotate, quat_yaw
 
 HOME = make_pose(np.array([1.0, 2.0, 1.25]), quat_from_yaw(0.7))
 DT = 0.04

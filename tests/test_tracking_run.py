@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import make_pose, pose_inverse, pose_multiply, quat_from_yaw
 from xop_lerobot.evaluation import tracking
 from xop_lerobot.evaluation.bench_report import make_table
 from xop_lerobot.evaluation.tracking import (
@@ -45,7 +46,6 @@ from xop_lerobot.evaluation.tracking_scenarios import (
 )
 from xop_lerobot.evaluation.tracking_setup import ABLATIONS, TrackingSetup, resolve_configs
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.transforms import make_pose, pose_inverse, pose_multiply, quat_from_yaw
 
 ROOT = Path(__file__).resolve().parent.parent
 HOME = make_pose(np.array([0.0, 0, 1.25]), np.array([1.0, 0, 0, 0]))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from xop_lerobot.transforms import (
+from xop_lerobot.core.transforms import (
     IDENTITY_POSE,
     compute_heading,
     compute_heading_squares,

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from carry import Carry
 
+from xop_lerobot.core.transforms import make_pose, quat_multiply
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.tasks import non_prehensile_transport as transport
 from xop_lerobot.tasks.stage import Stage
 from xop_lerobot.tasks.touching import Touching, compute_tilt
-from xop_lerobot.transforms import make_pose, quat_multiply
 
 TASK = "non_prehensile_transport"
 ROBOTS = ("g1", "rby1")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.evaluation.report_films import load_film, render_film
 from xop_lerobot.evaluation.study import Job, Results, run_job
 from xop_lerobot.evaluation.trial import Trace, TrialSetup, run_trial

@@ -6,6 +6,13 @@ import numpy as np
 import pytest
 from test_costs import H, K, draw_poses, make_evaluation
 
+from xop_lerobot.core.transforms import (
+    make_pose,
+    quat_exp,
+    quat_from_rpy,
+    quat_multiply,
+    rotation_error,
+)
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs import UprightCost
 from xop_lerobot.retarget.costs.upright import (
@@ -14,7 +21,6 @@ from xop_lerobot.retarget.costs.upright import (
     compute_upright_error,
     make_level,
 )
-from xop_lerobot.transforms import make_pose, quat_exp, quat_from_rpy, quat_multiply, rotation_error
 
 
 def rotate_z(quat: np.ndarray) -> np.ndarray:

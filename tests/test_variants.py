@@ -7,7 +7,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import (
+    make_pose,
+    quat_exp,
+    quat_from_rpy,
+    quat_multiply,
+    rotation_error,
+)
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -20,8 +28,6 @@ from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan
 from xop_lerobot.retarget.presets import build_configs
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import make_pose, quat_exp, quat_from_rpy, quat_multiply, rotation_error
 
 DT = 0.04
 

@@ -10,7 +10,8 @@ from test_dataset import create, tick
 from test_teleoperation import POLICIES, Person, Rig, make_frame, robots
 from toy_robot import Toy, make_teleop, make_toy
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.low_level.policy import POLICY_DT, make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
@@ -20,7 +21,6 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.plant.watch import GIVES_WAY, MOVES, Watch
-from xop_lerobot.transforms import quat_from_yaw
 
 every_robot = pytest.mark.parametrize("name", ["g1", "rby1", "toy"])
 

@@ -17,8 +17,9 @@ from ports import find_port
 from swaying import make_person
 from webxr_client import CODE, Page, encode
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import quat_from_matrix, quat_rotate
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.devices.webxr import PortTaken, WebXrDevice
 from xop_lerobot.operator.display import Cue, Display, Notice, Progress, Wish
@@ -26,7 +27,6 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.clock_offset import ClockOffset
 from xop_lerobot.operator.webxr.delay_meter import MAX_FRAMES, DelayMeter
 from xop_lerobot.operator.webxr.protocol import Bye, FrameMessage, Pong, parse_message
-from xop_lerobot.transforms import quat_from_matrix, quat_rotate
 
 RIGHT, UP, BACK = np.eye(3)
 LEFT, DOWN, FORWARD = -RIGHT, -UP, -BACK

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from xop_lerobot.core.transforms import compute_heading, quat_from_rpy
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.protocol import Bye, FrameMessage, parse_message
 from xop_lerobot.operator.webxr.server import PAGE
-from xop_lerobot.transforms import compute_heading, quat_from_rpy
 
 PRELUDE = """
 const makePose = ([x, y, z], emulatedPosition = false) => ({

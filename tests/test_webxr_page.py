@@ -17,10 +17,10 @@ from desk import CODE, Desk, wait_for
 from PIL import Image
 from ports import find_port
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import quat_rotate
 from xop_lerobot.operator.display import Cue, Progress, Wish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.transforms import quat_rotate
 
 pytestmark = pytest.mark.slow
 HARMLESS = {"taken", "repeated", "clock_unknown"}

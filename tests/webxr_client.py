@@ -14,10 +14,10 @@ from avp_server import rotation, wait_for
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from xop_lerobot.core.transforms import quat_from_matrix
 from xop_lerobot.operator.devices.axes import WORLD
 from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.transforms import quat_from_matrix
 
 CODE = "TESTCODE"
 AHEAD_S = 1000.0

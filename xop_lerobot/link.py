@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from xop_lerobot.errors import LinkError
+from xop_lerobot.core.errors import LinkError
+from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.operator.display import Cue, Progress, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.view import View
-from xop_lerobot.state import Goal, RobotState
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology

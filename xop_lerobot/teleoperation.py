@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.state import FRAMES, Goal, RobotState
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.reach import compute_forward_reach
@@ -44,7 +45,6 @@ from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.retarget.smoothing import CommandSmoother
 from xop_lerobot.retarget.state_sync import StateSync, Synced
-from xop_lerobot.state import FRAMES, Goal, RobotState
 
 RETREAT_RATE = 1.0
 """Speed at which arms in trouble go back to rest [rad/s]."""

@@ -7,12 +7,12 @@ from typing import ClassVar
 
 from lerobot.robots.config import RobotConfig
 
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.yaml_words import fill_nulls, find_text, find_word, recover_typed
 from xop_lerobot.dataset.rollout_pictures import watch_rollouts
-from xop_lerobot.errors import BadValue, UnknownName
 from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
 from xop_lerobot.tasks.heights import parse_heights
 from xop_lerobot.tasks.task import get_task
-from xop_lerobot.yaml_words import fill_nulls, find_text, find_word, recover_typed
 
 POLICY_HZ = 50
 """Rate of every low-level policy [Hz]; the control loop's rate divides it."""

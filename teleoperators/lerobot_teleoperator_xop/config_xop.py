@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 from lerobot.teleoperators.config import TeleoperatorConfig
 
+from xop_lerobot.core.yaml_words import fill_nulls, recover_typed
 from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.gestures import GestureConfig
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.yaml_words import fill_nulls, recover_typed
 
 
 @dataclass

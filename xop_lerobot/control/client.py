@@ -16,9 +16,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from xop_lerobot.command_line import make_output_readable
 from xop_lerobot.control.protocol import MAX_LINE, find_socket, read_object, write_object
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import BadValue, XopError
 
 _SWITCH = {"on": True, "true": True, "yes": True, "off": False, "false": False, "no": False}
 

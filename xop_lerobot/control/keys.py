@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from typing import Any, Protocol
 
-from xop_lerobot.errors import XopError
-from xop_lerobot.paced_log import PacedLog
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.paced_log import PacedLog
 
 _log = PacedLog(logging.getLogger(__name__))  # a key that is held down repeats
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.core.errors import BadValue, XopError
 
 MAX_LINE = 16_384
 """Longest request or answer [bytes]."""

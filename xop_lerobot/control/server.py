@@ -17,8 +17,8 @@ from xop_lerobot.control.protocol import (
     answer,
     write_object,
 )
-from xop_lerobot.errors import XopError
-from xop_lerobot.paced_log import PacedLog
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from xop_lerobot.state import RobotState
-from xop_lerobot.transforms import quat_conjugate, quat_rotate, quat_to_rpy
+from xop_lerobot.core.state import RobotState
+from xop_lerobot.core.transforms import quat_conjugate, quat_rotate, quat_to_rpy
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology

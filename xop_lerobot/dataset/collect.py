@@ -18,14 +18,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xop_lerobot.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.dataset.collect_config import CollectConfig
 from xop_lerobot.dataset.collect_flags import add_config, add_crew, read_config
 from xop_lerobot.dataset.collect_folder import CollectFolder
 from xop_lerobot.dataset.collect_jobs import WorkerFailed
 from xop_lerobot.dataset.collect_run import run_collection
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
-from xop_lerobot.errors import BadValue, XopError
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C or SIGTERM."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 
 if TYPE_CHECKING:
     from lerobot_robot_xop import XopRobotConfig

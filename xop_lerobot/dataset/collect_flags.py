@@ -6,9 +6,9 @@ import argparse
 from dataclasses import MISSING, fields
 from typing import Any
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.yaml_words import find_text
 from xop_lerobot.dataset.collect_config import CollectConfig
-from xop_lerobot.yaml_words import find_text
 
 
 def add_config(

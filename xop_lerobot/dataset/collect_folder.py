@@ -25,8 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from xop_lerobot.core.errors import XopError
 from xop_lerobot.dataset.facts import FACTS_DIR
-from xop_lerobot.errors import XopError
 
 COLLECT_FILE = FACTS_DIR / "collect.json"
 """What a collected dataset says of its collection."""

@@ -19,8 +19,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from xop_lerobot.errors import XopError
-from xop_lerobot.pool import run_jobs
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.pool import run_jobs
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.collect_config import CollectConfig
@@ -62,7 +62,7 @@ def make_attempts(
         XopError: If the cluster is not there, or not like this machine.
     """
     if ray:
-        from xop_lerobot.pool_ray import run_jobs_on_ray  # noqa: PLC0415 optional
+        from xop_lerobot.core.pool_ray import run_jobs_on_ray  # noqa: PLC0415 optional
 
         ship = _Ship(config, run)
         results = run_jobs_on_ray(ship, jobs, workers, address=ray, tries=_TRIES)

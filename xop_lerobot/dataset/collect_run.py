@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 from tqdm import tqdm
 
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.collect_folder import Attempt, CollectFolder
 from xop_lerobot.dataset.collect_jobs import make_attempts
-from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.collect_config import CollectConfig

@@ -19,8 +19,8 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from xop_lerobot.core.errors import LinkError
 from xop_lerobot.dataset.shutdown import TermAsInterrupt
-from xop_lerobot.errors import LinkError
 from xop_lerobot.link import get_session
 
 if TYPE_CHECKING:

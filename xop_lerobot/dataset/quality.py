@@ -21,9 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from xop_lerobot.errors import BadShape
+from xop_lerobot.core.errors import BadShape
+from xop_lerobot.core.transforms import quat_rotate, rotation_error
 from xop_lerobot.evaluation.metrics import NEVER, find_runs
-from xop_lerobot.transforms import quat_rotate, rotation_error
 
 STILL_WINDOW_S = 0.5
 """Time within which a thing that stands still does not leave its place [s]."""

@@ -44,13 +44,13 @@ from lerobot.utils.visualization_utils import (
 from lerobot_robot_xop import XopRobotConfig
 from lerobot_teleoperator_xop import XopConfig
 from lerobot_teleoperator_xop.terminal import listen_while_recording
-from xop_lerobot.command_line import make_output_readable
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.dataset.host import count_ticks
 from xop_lerobot.dataset.resume import check_storage
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
 from xop_lerobot.dataset.tick import run_tick
 from xop_lerobot.dataset.xop_dataset import XopDataset
-from xop_lerobot.errors import BadValue, XopError
 
 if TYPE_CHECKING:
     from lerobot_robot_xop.xop_robot import XopRobot

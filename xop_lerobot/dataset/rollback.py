@@ -16,9 +16,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.facts import EPISODES_FILE
-from xop_lerobot.errors import XopError
-from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset

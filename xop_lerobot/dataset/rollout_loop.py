@@ -8,9 +8,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.dataset.host import count_ticks, without_slowness
 from xop_lerobot.dataset.xop_dataset import XopDataset
-from xop_lerobot.errors import BadValue
 from xop_lerobot.link import get_session
 
 STRATEGY_MODULE = "lerobot.rollout.strategies.episodic"

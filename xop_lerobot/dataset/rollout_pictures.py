@@ -12,9 +12,9 @@ import functools
 import logging
 from typing import TYPE_CHECKING, Any
 
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.mistakes import report_mistakes
 from xop_lerobot.dataset.host import find
-from xop_lerobot.errors import BadValue
-from xop_lerobot.mistakes import report_mistakes
 
 if TYPE_CHECKING:
     from lerobot_robot_xop.config_xop import XopRobotConfig

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from xop_lerobot.core.state import RobotState
 from xop_lerobot.link import TickRecord
-from xop_lerobot.state import RobotState
 
 
 class Tally:

@@ -22,6 +22,8 @@ import numpy as np
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from xop_lerobot.core.errors import BadDataset, BadValue, XopError
+from xop_lerobot.core.state import RobotState
 from xop_lerobot.dataset import durability
 from xop_lerobot.dataset.columns import Columns, has_all_columns, is_own_column
 from xop_lerobot.dataset.embedding import skip_embedding
@@ -49,10 +51,8 @@ from xop_lerobot.dataset.shutdown import hold_signals
 from xop_lerobot.dataset.tally import Tally
 from xop_lerobot.dataset.video_queue import VideoQueue
 from xop_lerobot.dataset.wishes import grant
-from xop_lerobot.errors import BadDataset, BadValue, XopError
 from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
 from xop_lerobot.operator.display import Cue, Progress, Wish
-from xop_lerobot.state import RobotState
 
 logger = logging.getLogger(__name__)
 

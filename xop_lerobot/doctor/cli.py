@@ -17,7 +17,8 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from xop_lerobot.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.doctor.certificate import check_certificate
 from xop_lerobot.doctor.cpu import check_cpu
 from xop_lerobot.doctor.disk import check_disk
@@ -27,7 +28,6 @@ from xop_lerobot.doctor.headset import check_headset
 from xop_lerobot.doctor.interpreter import check_interpreter
 from xop_lerobot.doctor.plugin import check_plugin
 from xop_lerobot.doctor.ports import check_ports
-from xop_lerobot.errors import BadValue, UnknownName, XopError
 
 CHECKS: dict[str, Callable[[Setup], Finding]] = {
     "interpreter": check_interpreter,
@@ -83,7 +83,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Setup, tuple[str, ...], b
         BadValue: If a flag is malformed or out of its range.
         UnknownName: If a flag, device, robot, mode or check is unknown, listing the known ones.
     """
-    from xop_lerobot.command import Mode  # noqa: PLC0415
+    from xop_lerobot.core.command import Mode  # noqa: PLC0415
     from xop_lerobot.morphology.morphology import make_morphology  # noqa: PLC0415
 
     args = make_parser().parse(arguments)

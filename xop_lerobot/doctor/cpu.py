@@ -13,7 +13,7 @@ SHARE = 0.8
 
 def check_cpu(setup: Setup) -> Finding:
     """Time the planner of the robot, and compare with how often it is to plan."""
-    from xop_lerobot.command import Mode  # noqa: PLC0415
+    from xop_lerobot.core.command import Mode  # noqa: PLC0415
     from xop_lerobot.evaluation.bench import BenchConfig, run_bench  # noqa: PLC0415  MuJoCo
 
     mode = Mode[setup.mode.upper()]

@@ -26,9 +26,11 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from xop_lerobot.command import Mode, RobotAction
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import BadValue, UnknownName, XopError
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import BadValue, UnknownName, XopError
+from xop_lerobot.core.state import Goal, RobotState
+from xop_lerobot.core.transforms import make_pose
 from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
 from xop_lerobot.evaluation.tracking_scenarios import bend_from, make_curve
 from xop_lerobot.link import RobotInfo
@@ -43,9 +45,7 @@ from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.rollout import PolicyRollout
 from xop_lerobot.retarget.state_sync import StateSync
-from xop_lerobot.state import Goal, RobotState
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
-from xop_lerobot.transforms import make_pose
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.command_line import CommandParser, make_output_readable
-from xop_lerobot.errors import BadValue, UnknownName, XopError
+from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 
 logger = logging.getLogger(__name__)
 

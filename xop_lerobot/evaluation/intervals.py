@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 
 
 class Interval(NamedTuple):

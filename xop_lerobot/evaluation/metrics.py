@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from xop_lerobot.errors import BadShape, BadValue
-from xop_lerobot.transforms import quat_rotate, rotation_error
+from xop_lerobot.core.errors import BadShape, BadValue
+from xop_lerobot.core.transforms import quat_rotate, rotation_error
 
 JERK_WINDOW_S = 0.24
 """Length of the filter under which jerk is computed [s]."""

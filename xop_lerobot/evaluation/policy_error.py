@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from xop_lerobot.core.errors import BadDataset, BadValue
+from xop_lerobot.core.transforms import pose_inverse, pose_multiply
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.errors import BadDataset, BadValue
 from xop_lerobot.evaluation.intervals import Interval, compute_mean_interval
 from xop_lerobot.low_level.policy import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
@@ -22,7 +23,6 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.tasks.layout import find_palms
 from xop_lerobot.tasks.stage import Stage
-from xop_lerobot.transforms import pose_inverse, pose_multiply
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

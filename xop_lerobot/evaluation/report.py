@@ -12,7 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.page import FOOT, embed, escape, make_head
 from xop_lerobot.evaluation.bench_report import describe_machine
 from xop_lerobot.evaluation.intervals import Interval, compute_mean_interval, compute_rate_interval
 from xop_lerobot.evaluation.methods import get_method
@@ -26,7 +27,6 @@ from xop_lerobot.evaluation.report_plots import (
     plot_ways,
 )
 from xop_lerobot.evaluation.study import Cell, Results, compute_key
-from xop_lerobot.page import FOOT, embed, escape, make_head
 from xop_lerobot.plant.gl import RenderingUnavailable
 
 logger = logging.getLogger(__name__)

@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import quat_rotate
 from xop_lerobot.evaluation.strip import build_film, write_video
 from xop_lerobot.evaluation.trial import Film, TrialSetup, make_stage
-from xop_lerobot.transforms import quat_rotate
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = "task"

@@ -11,7 +11,7 @@ import av
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from xop_lerobot.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 
 LABEL_HEIGHT = 22
 """Height of the line of text over a picture [px]."""

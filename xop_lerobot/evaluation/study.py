@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 import xop_lerobot
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.pool import JobResult, run_jobs
 from xop_lerobot.evaluation.methods import find_absence
 from xop_lerobot.evaluation.trial import TrialSetup, run_trial
 from xop_lerobot.evaluation.trial_metrics import make_record
-from xop_lerobot.pool import JobResult, run_jobs
 
 TRIALS_FILE = "trials.jsonl"
 FILMS_FOLDER = "films"

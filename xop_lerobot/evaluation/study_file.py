@@ -9,12 +9,12 @@ from typing import Any
 
 import yaml
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.yaml_words import find_word, load_yaml
 from xop_lerobot.evaluation.methods import get_method
 from xop_lerobot.evaluation.study import Cell, make_cell
 from xop_lerobot.evaluation.trial import TrialSetup
 from xop_lerobot.plant.config import NOISE_PRESETS
-from xop_lerobot.yaml_words import find_word, load_yaml
 
 _STUDY_KEYS = ("trials", "seed", "noise", "fps", "time_limit", "low_level_paths", "groups")
 _LISTS = ("tasks", "methods", "variants", "low_levels")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.errors import BadShape, BadValue, UnknownName
-from xop_lerobot.transforms import quat_rotate
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.transforms import quat_rotate
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology

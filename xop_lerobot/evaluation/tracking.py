@@ -16,7 +16,14 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.errors import UnknownName
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import (
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_from_yaw,
+)
 from xop_lerobot.evaluation.tracking_metrics import (
     Trajectory,
     compute_errors,
@@ -44,14 +51,7 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Status
-from xop_lerobot.state import FRAMES
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
-from xop_lerobot.transforms import (
-    make_pose,
-    pose_inverse,
-    pose_multiply,
-    quat_from_yaw,
-)
 
 TRACE_DT = 0.2
 """Time between the points of a run's trace [s]."""

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.evaluation.bench_report import describe_versions, make_bench_blocks
 from xop_lerobot.evaluation.tracking_plot import plot_variants
 from xop_lerobot.evaluation.tracking_report import (

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.evaluation.bench_report import describe_machine, make_table
 from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, Scenario
 

@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import (
     make_pose,
     quat_from_rpy,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
 )
+from xop_lerobot.operator.interpolation import compute_heading
 
 LEAD_IN_S = 1.0
 """Time for which the first goal is the pose at home [s]."""

@@ -9,14 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.presets import build_configs
-from xop_lerobot.yaml_words import load_yaml
 
 
 @dataclass(frozen=True)

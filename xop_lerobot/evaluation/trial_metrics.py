@@ -9,7 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.evaluation.metrics import (
     compute_balance_power,
     compute_jerk,
@@ -21,7 +22,6 @@ from xop_lerobot.evaluation.metrics import (
 )
 from xop_lerobot.evaluation.trial import Trace, Trial
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
-from xop_lerobot.state import FRAMES
 
 TOUCH = 0.05
 """Distance at which a palm touches its point, in the paper [m]."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.low_level.description import Clock
 from xop_lerobot.low_level.policy import POLICY_DT
 

@@ -11,15 +11,15 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import compute_projected_gravity, quat_yaw
 from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.low_level.trial import BatchSimulation, TrialResult, run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.transforms import compute_projected_gravity, quat_yaw
 
 SEQUENCES_SEED = 1_000_000
 """Added to the seed, so that no sequence of a comparison was trained on."""

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 
 Positive = Annotated[int, Meta(ge=1)]
 type Numbers = float | tuple[float, ...] | dict[str, float]

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadShape, PolicyFileError
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadShape, PolicyFileError
 from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput
 
 if TYPE_CHECKING:

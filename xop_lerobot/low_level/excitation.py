@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.policy import POLICY_DT
 

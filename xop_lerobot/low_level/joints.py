@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 
 GROUPS = ("all", "legs", "waist", "arms")

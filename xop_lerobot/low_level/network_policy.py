@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadShape, BadValue
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadShape, BadValue
+from xop_lerobot.core.transforms import compute_projected_gravity, quat_conjugate, quat_rotate
 from xop_lerobot.low_level import description as d
 from xop_lerobot.low_level.joints import RobotJoints, as_index
 from xop_lerobot.low_level.network_stage import NetworkStage, Situation
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
 from xop_lerobot.low_level.rest import RestMap
 from xop_lerobot.low_level.terms import FeatureColumns
-from xop_lerobot.transforms import compute_projected_gravity, quat_conjugate, quat_rotate
 
 if TYPE_CHECKING:
     import mujoco

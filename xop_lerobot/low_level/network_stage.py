@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import quat_yaw, wrap_angle
 from xop_lerobot.low_level import description as d
 from xop_lerobot.low_level.clock import GaitClock
 from xop_lerobot.low_level.joints import RobotJoints, as_index
 from xop_lerobot.low_level.networks import LoadedNetwork, ReferenceNetwork
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.low_level.terms import FeatureColumns, TermReader, describe, spread_over
-from xop_lerobot.transforms import quat_yaw, wrap_angle
 
 
 class Situation(NamedTuple):

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from xop_lerobot.errors import PolicyFileError
+from xop_lerobot.core.errors import PolicyFileError
 
 if TYPE_CHECKING:
     import onnx

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import msgspec
 
-from xop_lerobot.errors import PolicyFileError
+from xop_lerobot.core.errors import PolicyFileError
 from xop_lerobot.low_level import description as d
 
 SUFFIX = ".onnx"

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import PolicyFileError, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import PolicyFileError, UnknownName
+from xop_lerobot.core.registry import Registry
 from xop_lerobot.low_level.rest import RestMap
-from xop_lerobot.registry import Registry
 
 if TYPE_CHECKING:
     import mujoco

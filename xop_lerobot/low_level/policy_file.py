@@ -7,7 +7,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-from xop_lerobot.errors import PolicyFileError
+from xop_lerobot.core.errors import PolicyFileError
 from xop_lerobot.low_level.description import File
 
 logger = logging.getLogger(__name__)

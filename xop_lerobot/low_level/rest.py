@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 
 
 class BaseRest(NamedTuple):

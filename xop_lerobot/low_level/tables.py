@@ -9,8 +9,8 @@ from typing import get_args
 
 import msgspec
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, PolicyFileError, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, PolicyFileError, UnknownName
 from xop_lerobot.low_level import description as d
 from xop_lerobot.low_level import onnx_metadata
 from xop_lerobot.low_level.joints import read_joints

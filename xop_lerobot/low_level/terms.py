@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.low_level import description as d
 from xop_lerobot.low_level.joints import RobotJoints
 

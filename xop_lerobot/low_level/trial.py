@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import compute_projected_gravity, quat_rotate, quat_yaw
 from xop_lerobot.low_level.excitation import Excitation
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
-from xop_lerobot.transforms import compute_projected_gravity, quat_rotate, quat_yaw
 
 FALL_HEIGHT = 0.35
 """Base height under which a robot counts as fallen [m]."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 
 
 class Acts(Enum):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.transforms import quat_from_matrix, quat_from_rpy
+from xop_lerobot.core.transforms import quat_from_matrix, quat_from_rpy
 
 if TYPE_CHECKING:
     import mujoco

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from xop_lerobot.command import ActionLayout, CommandSpace, Mode, RobotAction
+from xop_lerobot.core.command import ActionLayout, CommandSpace, Mode, RobotAction
+from xop_lerobot.core.registry import Registry
 from xop_lerobot.morphology.effect import Effect
 from xop_lerobot.morphology.tuning import MpcConfig, PaperParameters
-from xop_lerobot.registry import Registry
 
 if TYPE_CHECKING:
     import mujoco

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from xop_lerobot.core.registry import Registry
 from xop_lerobot.morphology.links import FLOOR_BIT, OBJECT_BIT
 from xop_lerobot.morphology.morphology import ModelKind, Morphology
 from xop_lerobot.morphology.sensing import add_sensing
-from xop_lerobot.registry import Registry
 
 if TYPE_CHECKING:
     import mujoco

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
-from xop_lerobot.transforms import make_pose
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import make_pose
 
 if TYPE_CHECKING:
     import mujoco

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
 
 WEIGHTINGS = ("raw", "minmax", "ess")
 SAMPLINGS = ("gaussian", "antithetic", "sobol")

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xop_lerobot.errors import BadShape, BadValue, UnknownName, XopError
-from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import (
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName, XopError
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -21,7 +19,9 @@ from xop_lerobot.transforms import (
     quat_multiply,
     quat_rotate,
 )
-from xop_lerobot.yaml_words import fill_nulls
+from xop_lerobot.core.yaml_words import fill_nulls
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_heading
 
 MIN_OPERATOR_HEIGHT = 0.5
 """Head height of a person under which the device's origin is surely not the floor [m]."""

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.operator.alignment import MIN_OPERATOR_HEIGHT
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.display import Cue, Display, NoticeBoard

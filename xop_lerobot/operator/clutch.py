@@ -8,10 +8,10 @@ from enum import Enum
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import quat_rotate
+from xop_lerobot.core.yaml_words import fill_nulls
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.transforms import quat_rotate
-from xop_lerobot.yaml_words import fill_nulls
 
 GESTURES = ("palms_up", "both_pinch")
 """`palms_up`: both hands pinch with their palms up. `both_pinch`: both pinch, however they lie."""

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from xop_lerobot.command import MODE_KEY
-from xop_lerobot.errors import BadRecording
+from xop_lerobot.core.command import MODE_KEY
+from xop_lerobot.core.errors import BadRecording
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import IDENTITY_POSE
 from xop_lerobot.operator.recording import (
     MIN_SAMPLES,
     NORM_TOLERANCE,
@@ -24,8 +26,6 @@ from xop_lerobot.operator.recording import (
     make_recording,
 )
 from xop_lerobot.operator.row_clock import RowClock, read_row_clock
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import IDENTITY_POSE
 
 logger = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.operator.display import Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.view import View

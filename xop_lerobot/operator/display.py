@@ -10,8 +10,8 @@ from enum import Enum
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.paced_log import PacedLog
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from xop_lerobot.core.state import RobotState
 from xop_lerobot.operator.alignment import Alignment, EngageRefused, is_lost
 from xop_lerobot.operator.clutch import Clutch, Wish
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.display import Cue, NoticeBoard
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.state import RobotState
 
 logger = logging.getLogger(__name__)
 

@@ -9,12 +9,12 @@ from enum import Enum
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.yaml_words import fill_nulls, find_word
 from xop_lerobot.operator.clutch import ClutchConfig
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.raised_hands import RaisedHandsConfig
 from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS
-from xop_lerobot.yaml_words import fill_nulls, find_word
 
 HANDS = ("left", "right")
 GRIP_OPEN = 0.06

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
-from xop_lerobot.transforms import rotation_error
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import rotation_error
 
 
 @dataclass

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xop_lerobot.operator.interpolation import compute_heading, compute_minimum_jerk
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import (
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -19,6 +18,7 @@ from xop_lerobot.transforms import (
     quat_multiply,
     rotation_error,
 )
+from xop_lerobot.operator.interpolation import compute_heading, compute_minimum_jerk
 
 BLEND_S = 1.0
 """Time in which a hand's goal goes from where it was held to where the hand is [s]."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.transforms import (
+from xop_lerobot.core.transforms import (
     compute_heading,
     make_pose,
     quat_conjugate,

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import make_pose, quat_conjugate, quat_exp, quat_log, quat_multiply
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import make_pose, quat_conjugate, quat_exp, quat_log, quat_multiply
 
 
 @dataclass

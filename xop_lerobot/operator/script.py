@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import quat_from_rpy
+from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
 from xop_lerobot.operator.recording import FARTHEST_M, describe_distance
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import quat_from_rpy
-from xop_lerobot.yaml_words import load_yaml
 
 SCRIPTS = Path(__file__).parent / "scripts"
 """Where the built-in scripts are."""

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xop_lerobot.errors import BadValue
-from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import (
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -22,6 +21,7 @@ from xop_lerobot.transforms import (
     quat_multiply,
     rotation_error,
 )
+from xop_lerobot.operator.frame import OperatorFrame
 
 MIN_STEP_TIME = 1 / 90
 """However close behind each other two frames come, so much lies between what they show [s]."""

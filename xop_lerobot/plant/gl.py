@@ -8,7 +8,7 @@ import os
 import sys
 from typing import Protocol
 
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.errors import XopError
 
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 _OFF = ("disable", "disabled", "off", "false", "0")

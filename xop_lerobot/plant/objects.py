@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.errors import UnknownName
 
 
 class SceneObjects:

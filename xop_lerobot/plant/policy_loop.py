@@ -8,13 +8,13 @@ from types import MappingProxyType
 
 import numpy as np
 
-from xop_lerobot.command import RobotAction, check_vector
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.command import RobotAction, check_vector
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.state import RobotState, freeze
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.plant.plant import Measurement, Plant
 from xop_lerobot.plant.watch import Watch
-from xop_lerobot.state import RobotState, freeze
 
 # Measured speed of the base under which a robot stands still [m/s]: five standard deviations of
 # the noise of one axis in the mild preset, so that a standing robot is seen to stand.

@@ -9,12 +9,12 @@ import time
 
 import numpy as np
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.state import RobotState
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.plant.plant import Plant
 from xop_lerobot.plant.policy_loop import PolicyLoop
-from xop_lerobot.state import RobotState
 
 logger = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 import mujoco
 import numpy as np
 
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.plant.gl import GlContext, make_gl_context
 
 MAX_GEOMS = 2000

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import quat_exp, quat_from_yaw, quat_multiply, quat_yaw
 from xop_lerobot.plant.config import NoiseConfig, compute_num_steps
-from xop_lerobot.transforms import quat_exp, quat_from_yaw, quat_multiply, quat_yaw
 
 SLIDE_SCALE = 0.1
 """Encoder noise of a sliding joint over that of a hinge [m/rad]."""

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import check_vector
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.command import check_vector
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import make_pose
 from xop_lerobot.plant.config import SimulationConfig, compute_num_steps
 from xop_lerobot.plant.contacts import ContactTable
 from xop_lerobot.plant.objects import SceneObjects
 from xop_lerobot.plant.plant import Measurement, Plant
 from xop_lerobot.plant.rendering import Cameras
 from xop_lerobot.plant.sensors import Sensors
-from xop_lerobot.transforms import make_pose
 
 if TYPE_CHECKING:
     from xop_lerobot.low_level.policy import LowLevelPolicy

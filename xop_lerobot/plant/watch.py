@@ -5,11 +5,11 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode, RobotAction
+from xop_lerobot.core.command import Mode, RobotAction
+from xop_lerobot.core.transforms import quat_yaw
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.transforms import quat_yaw
 
 MOVES = "the robot moves though it is told to stand"
 GIVES_WAY = "the robot's servos give way under the load"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from xop_lerobot.transforms import (
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,

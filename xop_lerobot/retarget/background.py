@@ -6,11 +6,11 @@ import logging
 import threading
 from typing import Any, NamedTuple
 
+from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.retarget.delay import StatePredictor, predict_goal
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.retarget.plan_track import PlanTrack, StampedPlan
-from xop_lerobot.state import Goal, RobotState
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.command_model import CommandModel
@@ -18,7 +19,6 @@ from xop_lerobot.retarget.offset import OffsetObserver
 from xop_lerobot.retarget.posture_guide import Served
 from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights, pace
 from xop_lerobot.retarget.static_load import StaticLoad
-from xop_lerobot.state import Goal, RobotState
 
 
 class Candidates:

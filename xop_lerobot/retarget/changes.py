@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig, split_names

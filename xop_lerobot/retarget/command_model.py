@@ -8,17 +8,17 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import CommandSpace, Mode
-from xop_lerobot.low_level.rest import BaseRest, RestMap
-from xop_lerobot.morphology.effect import Acts, Effect
-from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import CommandSpace, Mode
+from xop_lerobot.core.transforms import (
     quat_conjugate,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
     quat_yaw,
 )
+from xop_lerobot.low_level.rest import BaseRest, RestMap
+from xop_lerobot.morphology.effect import Acts, Effect
+from xop_lerobot.morphology.morphology import Morphology
 
 _TWIST = (Acts.FORWARD, Acts.LEFT, Acts.TURN)
 _TURN = 2

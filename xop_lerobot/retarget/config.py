@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.yaml_words import fill_nulls, find_text
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.yaml_words import fill_nulls, find_text
 
 RETARGETERS = ("mpc", "direct")
 PRESETS = ("default", "conservative", "aggressive", "table1")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import CommandDim
+from xop_lerobot.core.command import CommandDim
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arm_ik import ARM_MAX_RATE

@@ -7,12 +7,12 @@ from collections import deque
 
 import numpy as np
 
+from xop_lerobot.core.state import Goal, RobotState, freeze
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.horizon_goals import preview
 from xop_lerobot.retarget.plan_track import PlanTrack, overlay_arms
 from xop_lerobot.retarget.rollout import PolicyRollout
-from xop_lerobot.state import Goal, RobotState, freeze
 
 _GOAL_S = 0.3  # longest time over which a goal is assumed to keep its velocity [s]
 

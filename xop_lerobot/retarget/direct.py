@@ -7,14 +7,9 @@ from time import perf_counter
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.morphology.effect import Acts
-from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
-from xop_lerobot.retarget.plan import Plan, Retargeter
-from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
-from xop_lerobot.state import Goal, RobotState
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal, RobotState
+from xop_lerobot.core.transforms import (
     compute_heading,
     make_pose,
     quat_from_yaw,
@@ -22,6 +17,11 @@ from xop_lerobot.transforms import (
     quat_yaw,
     wrap_angle,
 )
+from xop_lerobot.morphology.effect import Acts
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
+from xop_lerobot.retarget.plan import Plan, Retargeter
+from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
 
 
 class DirectRetargeter(Retargeter):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from xop_lerobot.core.transforms import quat_yaw, wrap_angle
 from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.transforms import quat_yaw, wrap_angle
 
 _MAX = np.array([0.3, 0.3, 0.4])  # [m/s, m/s, rad/s]; more is a stumble, not a drift
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from xop_lerobot.core.transforms import compute_heading, quat_yaw
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.costs.lateral import compute_facing
-from xop_lerobot.transforms import compute_heading, quat_yaw
 
 
 class FacingRule:

@@ -7,7 +7,8 @@ import logging
 
 import mujoco
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.low_level.policy import LowLevelPolicy
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -19,7 +20,6 @@ from xop_lerobot.retarget.obstacle_file import load_obstacles
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.retarget.presets import build_configs
-from xop_lerobot.wording import say_count
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import quat_from_yaw, quat_multiply
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
@@ -18,8 +20,6 @@ from xop_lerobot.retarget.horizon_goals import hold_near, preview
 from xop_lerobot.retarget.posture_guide import HEAD, Served
 from xop_lerobot.retarget.route import RoutePlanner
 from xop_lerobot.retarget.twist_room import TwistRoom
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import quat_from_yaw, quat_multiply
 
 _LOOK_AHEAD = 1.6  # length of a way that is looked at: about a quarter turn [s]
 _STILL = 0.1  # speed of a goal under which it counts as standing still [m/s]

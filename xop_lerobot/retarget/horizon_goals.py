@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import make_pose, quat_multiply
 from xop_lerobot.retarget.costs.upright import make_level
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import make_pose, quat_multiply
 
 
 def hold_near(goal: Goal, poses: Mapping[str, np.ndarray], reach: float) -> Goal:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.transforms import make_pose, quat_from_matrix
 from xop_lerobot.retarget.linearisation import find_site
-from xop_lerobot.transforms import make_pose, quat_from_matrix
 
 _HINGE, _SLIDE, _FREE = (
     int(kind)

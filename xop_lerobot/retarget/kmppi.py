@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from xop_lerobot.errors import BadShape
+from xop_lerobot.core.errors import BadShape
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.optimizer import OPTIMIZERS, Samples, SamplingOptimizer
 from xop_lerobot.retarget.sampling import DRAWS

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.retarget.static_load import StaticLoad
 
 

@@ -11,8 +11,9 @@ from time import perf_counter
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import UnknownName
+from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
@@ -36,7 +37,6 @@ from xop_lerobot.retarget.posture_guide import HEAD, PostureGuide, Served
 from xop_lerobot.retarget.readings import Readings
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
 from xop_lerobot.retarget.weighting import compute_effective_samples
-from xop_lerobot.state import Goal, RobotState
 
 
 class MpcRetargeter(Retargeter):

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.transforms import quat_from_rpy
+from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.retarget.obstacles import Obstacle
-from xop_lerobot.transforms import quat_from_rpy
-from xop_lerobot.yaml_words import load_yaml
 
 SIZES = {
     "box": ("size",),

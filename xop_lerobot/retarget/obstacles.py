@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from xop_lerobot.errors import BadValue, UnknownName
-from xop_lerobot.transforms import quat_conjugate, quat_rotate
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import quat_conjugate, quat_rotate
 
 SHAPES = ("box", "sphere", "cylinder", "capsule")
 _GEOMS = {

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.changes import (
     Change,

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from xop_lerobot.errors import BadShape, BadValue
+from xop_lerobot.core.errors import BadShape, BadValue
+from xop_lerobot.core.registry import Registry
 from xop_lerobot.morphology.tuning import SAMPLINGS, MpcConfig
-from xop_lerobot.registry import Registry
 
 
 class Samples(NamedTuple):

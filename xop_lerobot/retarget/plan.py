@@ -9,10 +9,10 @@ from enum import IntEnum
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.obstacles import Obstacle
-from xop_lerobot.state import Goal, RobotState
 
 
 class Status(IntEnum):

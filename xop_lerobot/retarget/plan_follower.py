@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.delay import LatencyMeter, StatePredictor
@@ -13,7 +14,6 @@ from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.retarget.plan_track import StampedPlan
-from xop_lerobot.state import Goal, RobotState
 
 
 class PlanFollower:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from xop_lerobot.command import CommandSpace
+from xop_lerobot.core.command import CommandSpace
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.retarget.plan import Plan
 

@@ -7,13 +7,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.retarget.costs.support import SupportArea
-from xop_lerobot.retarget.linearisation import Placement
-from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights, Solution
-from xop_lerobot.retarget.static_load import StaticLoad
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import (
     compute_heading,
     compute_heading_squares,
     make_pose,
@@ -24,6 +19,11 @@ from xop_lerobot.transforms import (
     rotation_error,
     sum_squares,
 )
+from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.costs.support import SupportArea
+from xop_lerobot.retarget.linearisation import Placement
+from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights, Solution
+from xop_lerobot.retarget.static_load import StaticLoad
 
 AT_REST_S = 20.0
 """Time after which a robot has taken a command up, whatever its lags [s]."""

@@ -10,17 +10,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
-from xop_lerobot.retarget.costs.support import SupportArea
-from xop_lerobot.retarget.linearisation import Placement
-from xop_lerobot.retarget.posture import AT_REST_S, MISSED, Found, PostureSearch, Repertoire
-from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
-from xop_lerobot.retarget.static_load import StaticLoad
-from xop_lerobot.state import Goal
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import (
     compute_heading,
     heading_error,
     make_pose,
@@ -31,6 +23,14 @@ from xop_lerobot.transforms import (
     quat_rotate,
     quat_yaw,
 )
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.tuning import MpcConfig
+from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
+from xop_lerobot.retarget.costs.support import SupportArea
+from xop_lerobot.retarget.linearisation import Placement
+from xop_lerobot.retarget.posture import AT_REST_S, MISSED, Found, PostureSearch, Repertoire
+from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
+from xop_lerobot.retarget.static_load import StaticLoad
 
 HEAD = "head"
 _EFFORT, _LEVEL_EFFORT = 0.002, 0.01  # of a posture, which has all the time to get there

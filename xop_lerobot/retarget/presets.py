@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import CostWeights, MpcConfig, PaperParameters
 from xop_lerobot.retarget.changes import Settings, make_settings

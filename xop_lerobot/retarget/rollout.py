@@ -10,8 +10,8 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadShape, BadValue
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadShape, BadValue
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 
 _DIVERGED = 1e4  # no position [m, rad] or velocity [m/s, rad/s] of a sound prediction is as large

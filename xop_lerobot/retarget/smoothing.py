@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.command import CommandSpace, Mode, check_vector
+from xop_lerobot.core.command import CommandSpace, Mode, check_vector
 
 _AT_REST = 1e-9  # velocities up to here are neutral [their unit]
 

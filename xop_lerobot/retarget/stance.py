@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.retarget.sync_config import SyncConfig
 from xop_lerobot.retarget.sync_contacts import Contact, compute_height
 

@@ -10,7 +10,8 @@ import mink
 import mujoco
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import freeze
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.sensor_filter import SensorFilter
 from xop_lerobot.retarget.stance import StanceMemory
@@ -24,7 +25,6 @@ from xop_lerobot.retarget.velocity_projection import (
     project_velocity,
     solve_positive,
 )
-from xop_lerobot.state import freeze
 
 logger = logging.getLogger(__name__)
 

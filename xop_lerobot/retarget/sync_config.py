@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 from enum import IntEnum
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 
 
 class SyncStatus(IntEnum):

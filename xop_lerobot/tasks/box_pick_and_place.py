@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from xop_lerobot.core.transforms import make_pose, quat_conjugate, quat_from_yaw, quat_rotate
 from xop_lerobot.operator.view import SeenObject
 from xop_lerobot.tasks import furniture
 from xop_lerobot.tasks.heights import HeightRange
@@ -21,7 +22,6 @@ from xop_lerobot.tasks.layout import (
 )
 from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
 from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
-from xop_lerobot.transforms import make_pose, quat_conjugate, quat_from_yaw, quat_rotate
 
 if TYPE_CHECKING:
     import mujoco

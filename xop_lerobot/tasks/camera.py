@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.transforms import quat_from_matrix
+from xop_lerobot.core.transforms import quat_from_matrix
 
 if TYPE_CHECKING:
     import mujoco

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.tasks.dual_point_touch import DualPointTouch
 from xop_lerobot.tasks.furniture import place
 from xop_lerobot.tasks.heights import HeightRange
 from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import make_direction
 from xop_lerobot.tasks.task import TASKS
-from xop_lerobot.transforms import quat_from_yaw
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

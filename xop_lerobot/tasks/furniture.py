@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.errors import UnknownName
+from xop_lerobot.core.transforms import make_pose
 from xop_lerobot.morphology.links import FLOOR_BIT, OBJECT_BIT
-from xop_lerobot.transforms import make_pose
 
 if TYPE_CHECKING:
     import mujoco

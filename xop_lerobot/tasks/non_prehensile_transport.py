@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 import numpy as np
 
-from xop_lerobot.operator.view import SeenObject
-from xop_lerobot.tasks import furniture, palm
-from xop_lerobot.tasks.hold import Hold
-from xop_lerobot.tasks.layout import find_palms, make_direction, measure_pad, measure_reach
-from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
-from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
-from xop_lerobot.transforms import (
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
     quat_from_yaw,
     quat_multiply,
 )
+from xop_lerobot.operator.view import SeenObject
+from xop_lerobot.tasks import furniture, palm
+from xop_lerobot.tasks.hold import Hold
+from xop_lerobot.tasks.layout import find_palms, make_direction, measure_pad, measure_reach
+from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology

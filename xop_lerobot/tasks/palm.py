@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from xop_lerobot.core.transforms import make_pose, pose_inverse, pose_multiply, quat_from_rpy
 from xop_lerobot.morphology.links import FLOOR_BIT, OBJECT_BIT
 from xop_lerobot.retarget.arm_ik import ArmIk
 from xop_lerobot.tasks.layout import Pad, Reach
-from xop_lerobot.transforms import make_pose, pose_inverse, pose_multiply, quat_from_rpy
 
 if TYPE_CHECKING:
     import mujoco

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.command import RobotAction
+from xop_lerobot.core.command import RobotAction
 from xop_lerobot.morphology.scene import build_scene_spec
 from xop_lerobot.operator.view import View
 from xop_lerobot.plant.config import SimulationConfig
@@ -18,8 +18,8 @@ from xop_lerobot.tasks.layout import find_palms
 from xop_lerobot.tasks.task import Task, TaskStatus, make_task
 
 if TYPE_CHECKING:
+    from xop_lerobot.core.state import RobotState
     from xop_lerobot.morphology.morphology import Morphology
-    from xop_lerobot.state import RobotState
 
 AFTER_SUCCESS_S = 1.0
 """An episode goes on for so long after its success [s]."""

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.dataset.curate.destination import Destination
-from xop_lerobot.errors import BadValue
 
 
 def add_source(parser: CommandParser) -> None:

@@ -12,10 +12,10 @@ import os
 import sys
 from collections.abc import Sequence
 
-from xop_lerobot.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.dataset.curate.verbs import VERBS, Verb, load_verb
 from xop_lerobot.dataset.shutdown import stop_on_sigterm
-from xop_lerobot.errors import BadValue, UnknownName, XopError
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C or SIGTERM, as shells have it."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.errors import BadDataset, BadShape, BadValue
+from xop_lerobot.core.errors import BadDataset, BadShape, BadValue
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -21,8 +21,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO
 
+from xop_lerobot.core.errors import XopError
 from xop_lerobot.dataset.collect_folder import FolderTaken, sync_folder, sync_tree
-from xop_lerobot.errors import XopError
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2

@@ -12,9 +12,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from xop_lerobot.core.errors import BadDataset
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.facts import EPISODES_FILE, FACTS_PREFIX
-from xop_lerobot.errors import BadDataset
-from xop_lerobot.wording import say_count
 
 UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError)
 """What reading a malformed parquet file may raise."""

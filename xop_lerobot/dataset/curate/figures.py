@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.dataset.curate.expression import Kind
-from xop_lerobot.state import FRAMES
 
 _FLAG, _NUMBER, _TEXT = Kind.FLAG, Kind.NUMBER, Kind.TEXT
 

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadDataset, XopError
 from xop_lerobot.dataset.curate.arguments import (
     add_destination,
     add_source,
@@ -30,7 +31,6 @@ from xop_lerobot.dataset.curate.arguments import (
 from xop_lerobot.dataset.curate.expression import Expression
 from xop_lerobot.dataset.curate.figures import KINDS, describe_figures
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
-from xop_lerobot.errors import BadDataset, XopError
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.dataset.curate.expression import Expression, Kind
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
-from xop_lerobot.errors import BadValue
 
 OTHER = "other"
 """Sub-task of the frames in which no rule holds."""

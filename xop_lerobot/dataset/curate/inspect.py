@@ -21,13 +21,13 @@ from typing import IO, Any
 
 from tqdm import tqdm
 
-from xop_lerobot.command_line import CommandParser, can_print_anything
+from xop_lerobot.core.command_line import CommandParser, can_print_anything
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.arguments import add_source, show_progress
 from xop_lerobot.dataset.curate.expression import UnknownFigure
 from xop_lerobot.dataset.curate.figures import FIGURES, KINDS, describe_figures
 from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.errors import BadValue
-from xop_lerobot.wording import say_count
 
 SUMMARY = "show what is in a dataset: tracking, smoothness, falls, gaps, idle time, …"
 

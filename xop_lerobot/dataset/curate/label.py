@@ -27,7 +27,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.arguments import (
     add_destination,
     add_source,
@@ -46,8 +48,6 @@ from xop_lerobot.dataset.curate.labels import (
 )
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.dataset.curate.subtasks import SUBTASK, write_subtasks
-from xop_lerobot.errors import BadValue
-from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
+from xop_lerobot.core.errors import BadDataset, BadValue
 from xop_lerobot.dataset.curate.label_session import HELP, LabelSession
 from xop_lerobot.dataset.curate.pictures import Cut, decode
-from xop_lerobot.errors import BadDataset, BadValue
 from xop_lerobot.evaluation.strip import build_film, choose_moments, write_strip
 
 if TYPE_CHECKING:

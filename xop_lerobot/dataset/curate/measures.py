@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from xop_lerobot.core.errors import UnknownName
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.dataset import quality
 from xop_lerobot.dataset.curate.entries import EpisodeEntry
 from xop_lerobot.dataset.curate.figures import FIGURES
-from xop_lerobot.errors import UnknownName
 from xop_lerobot.evaluation.metrics import compute_jerk, compute_roughness
 from xop_lerobot.evaluation.summary import compute_falls
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
-from xop_lerobot.state import FRAMES
 
 type Features = Mapping[str, Mapping[str, Any]]
 type Values = Mapping[str, float | int | bool | None]

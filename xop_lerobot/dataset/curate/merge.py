@@ -15,7 +15,9 @@ from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadDataset, BadValue
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.arguments import (
     add_destination,
     add_sources,
@@ -24,8 +26,6 @@ from xop_lerobot.dataset.curate.arguments import (
     show_progress,
 )
 from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.errors import BadDataset, BadValue
-from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from xop_lerobot.core.errors import BadDataset
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.entries import UNREADABLE, EpisodeEntry
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.curate.task_words import (
@@ -19,11 +21,9 @@ from xop_lerobot.dataset.curate.task_words import (
     has_index_of_words,
     read_tasks,
 )
-from xop_lerobot.errors import BadDataset
 from xop_lerobot.operator.dataset_recording import CLOCKS
 from xop_lerobot.operator.recording import FARTHEST_M
 from xop_lerobot.operator.row_clock import LONGEST_HOLD_S, read_row_clock
-from xop_lerobot.wording import say_count
 
 _ANEW = "`xop-curate filter` counts anew"
 _TOLERANCE_S = 1e-4

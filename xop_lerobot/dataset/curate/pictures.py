@@ -19,8 +19,8 @@ import av
 import numpy as np
 from av.error import FFmpegError
 
+from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.curate.packets import find_framing
-from xop_lerobot.errors import BadDataset
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.arguments import (
     add_destination,
     add_source,
     make_destination,
     show_progress,
 )
-from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip

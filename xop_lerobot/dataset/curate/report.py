@@ -19,11 +19,11 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadDataset, BadValue
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.arguments import add_source, show_progress
 from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.errors import BadDataset, BadValue
-from xop_lerobot.wording import say_count
 
 SUMMARY = "write one HTML page: figures, plots, pictures and timelines of the episodes"
 

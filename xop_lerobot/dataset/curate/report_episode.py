@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from xop_lerobot.core.errors import BadDataset, XopError
+from xop_lerobot.core.page import dump_script, embed, escape
 from xop_lerobot.dataset.curate.figures import FIGURES
 from xop_lerobot.dataset.curate.measures import Episode
 from xop_lerobot.dataset.curate.source import Source
@@ -17,8 +19,6 @@ from xop_lerobot.dataset.curate.survey import Finding
 from xop_lerobot.dataset.curate.tables import format_value
 from xop_lerobot.dataset.curate.timeline import PARTS, Band, Panel, Part, describe_changes
 from xop_lerobot.dataset.curate.traces import encode, thin
-from xop_lerobot.errors import BadDataset, XopError
-from xop_lerobot.page import dump_script, embed, escape
 
 CHIPS = (
     "duration", "tracking_p95", "tracking_angle_p95", "command_roughness", "gap_time",

@@ -17,14 +17,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Self
 
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.page import FOOT, dump_script, escape, make_head
 from xop_lerobot.dataset.curate.figures import FIGURES
 from xop_lerobot.dataset.curate.inspect import SHOWN, SUMMARISED
 from xop_lerobot.dataset.curate.report_episode import Limits, make_section
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.curate.survey import Finding
 from xop_lerobot.dataset.curate.tables import Totals
-from xop_lerobot.errors import XopError
-from xop_lerobot.page import FOOT, dump_script, escape, make_head
 
 _ASSETS = resources.files("xop_lerobot.dataset.curate") / "page"
 _DIGITS = 7

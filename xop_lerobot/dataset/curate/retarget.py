@@ -22,7 +22,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadDataset, BadValue, XopError
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.collect_flags import add_config, add_crew, read_config
 from xop_lerobot.dataset.collect_folder import CollectFolder, FolderTaken, write_whole
 from xop_lerobot.dataset.collect_run import Collection, run_collection
@@ -38,8 +40,6 @@ from xop_lerobot.dataset.curate.retarget_config import (
 from xop_lerobot.dataset.curate.retarget_source import Operators, RetargetJob, parse_episodes
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.dataset.facts import FACTS_DIR
-from xop_lerobot.errors import BadDataset, BadValue, XopError
-from xop_lerobot.wording import say_count
 
 SUMMARY = "replay the operators with another robot, retargeter or policy"
 

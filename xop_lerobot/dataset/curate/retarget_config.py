@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.dataset.collect_config import CollectConfig, import_plugins
-from xop_lerobot.errors import BadValue, UnknownName
-from xop_lerobot.yaml_words import load_yaml
 
 if TYPE_CHECKING:
     from lerobot_teleoperator_xop import XopConfig

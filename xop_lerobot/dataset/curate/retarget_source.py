@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from xop_lerobot.core.errors import BadDataset, BadRecording, BadValue
 from xop_lerobot.dataset.curate.clip import PROVENANCE, Clip, Step, make_facts
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.dataset.curate.task_words import TASK, read_tasks
-from xop_lerobot.errors import BadDataset, BadRecording, BadValue
 from xop_lerobot.operator.dataset_recording import choose_columns, make_dataset_recording
 from xop_lerobot.operator.recording import Recording
 

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import update_chunk_file_indices
 
-from xop_lerobot.errors import BadDataset
+from xop_lerobot.core.errors import BadDataset
 
 
 class RowFiles:

@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.curate.column_check import find_faults
 from xop_lerobot.dataset.curate.entries import UNREADABLE, EpisodeEntry
-from xop_lerobot.errors import BadDataset
 
 INDEX = "episode_index"
 

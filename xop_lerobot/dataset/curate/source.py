@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 import pyarrow as pa
 
+from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.curate.entries import (
     EpisodeEntry,
     VideoSpan,
@@ -22,7 +23,6 @@ from xop_lerobot.dataset.curate.entries import (
 )
 from xop_lerobot.dataset.curate.rows import RowReader
 from xop_lerobot.dataset.facts import CONFIG_FILE
-from xop_lerobot.errors import BadDataset
 
 __all__ = ["EpisodeEntry", "Source", "VideoSpan"]
 

@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.arguments import (
     add_destination,
     add_source,
@@ -25,8 +27,6 @@ from xop_lerobot.dataset.curate.arguments import (
     show_progress,
 )
 from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.errors import BadValue
-from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.curate.pictures import Cut, decode
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
-from xop_lerobot.errors import BadDataset
 from xop_lerobot.evaluation.strip import choose_moments
 
 _QUALITY = 72

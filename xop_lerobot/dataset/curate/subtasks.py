@@ -8,7 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from xop_lerobot.errors import BadDataset
+from xop_lerobot.core.errors import BadDataset
 
 SUBTASK = "subtask_index"
 SUBTASKS_FILE = Path("meta") / "subtasks.parquet"

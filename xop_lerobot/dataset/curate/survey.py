@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from xop_lerobot.core.errors import BadDataset, XopError
 from xop_lerobot.dataset.curate.expression import Kind
 from xop_lerobot.dataset.curate.figures import FIGURES, KINDS
 from xop_lerobot.dataset.curate.measures import MEASURES, Episode, Measure
 from xop_lerobot.dataset.curate.order_check import OrderCheck
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
 from xop_lerobot.dataset.curate.video_check import VideoCheck
-from xop_lerobot.errors import BadDataset, XopError
 
 _FACTS = {
     name: name

@@ -19,6 +19,8 @@ from lerobot.datasets.compute_stats import compute_episode_stats
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import DEFAULT_DATA_PATH
 
+from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import make_pose, quat_from_yaw
 from xop_lerobot.dataset.body import Body
 from xop_lerobot.dataset.columns import HEALTH_NAMES, Columns
 from xop_lerobot.dataset.facts import (
@@ -30,8 +32,6 @@ from xop_lerobot.dataset.facts import (
 )
 from xop_lerobot.link import RobotInfo
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
-from xop_lerobot.state import FRAMES
-from xop_lerobot.transforms import make_pose, quat_from_yaw
 
 TASK = "walk to and fro and wave"
 _SUCCEEDS, _FALLS, _LOSES = 0.7, 0.05, 0.1

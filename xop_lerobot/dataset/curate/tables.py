@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.expression import Kind
 from xop_lerobot.dataset.curate.figures import FIGURES
-from xop_lerobot.wording import say_count
 
 UNKNOWN = "-"
 _HEADS = {

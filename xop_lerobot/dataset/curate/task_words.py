@@ -7,8 +7,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.curate.entries import UNREADABLE
-from xop_lerobot.errors import BadDataset
 
 TASK = "task_index"
 TASKS_FILE = Path("meta") / "tasks.parquet"

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.dataset import quality
 from xop_lerobot.dataset.curate.measures import (
     ACTION,
@@ -28,7 +29,6 @@ from xop_lerobot.dataset.curate.measures import (
 )
 from xop_lerobot.dataset.curate.source import EpisodeEntry
 from xop_lerobot.evaluation.metrics import find_runs
-from xop_lerobot.state import FRAMES
 
 POSE = 7
 MOST_ENTRIES = 32

@@ -21,6 +21,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.utils import DEFAULT_CHUNK_SIZE, DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
 
+from xop_lerobot.core.errors import BadDataset, XopError
 from xop_lerobot.dataset.curate.clip import PROVENANCE, Clip, Step, make_facts, make_refusal
 from xop_lerobot.dataset.curate.episode_stats import (
     Stats,
@@ -44,7 +45,6 @@ from xop_lerobot.dataset.facts import (
     EpisodeFacts,
     compute_config_hash,
 )
-from xop_lerobot.errors import BadDataset, XopError
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadDataset, BadValue
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset import quality
 from xop_lerobot.dataset.curate.arguments import (
     add_destination,
@@ -27,8 +29,6 @@ from xop_lerobot.dataset.curate.arguments import (
 )
 from xop_lerobot.dataset.curate.measures import IDLE, Episode, find_idle
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
-from xop_lerobot.errors import BadDataset, BadValue
-from xop_lerobot.wording import say_count
 
 if TYPE_CHECKING:
     from xop_lerobot.dataset.curate.clip import Clip

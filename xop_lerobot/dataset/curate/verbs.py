@@ -16,8 +16,8 @@ import argparse
 import importlib
 from typing import Protocol, cast
 
-from xop_lerobot.command_line import CommandParser
-from xop_lerobot.errors import UnknownName
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import UnknownName
 
 _PACKAGE = "xop_lerobot.dataset.curate"
 VERBS = {

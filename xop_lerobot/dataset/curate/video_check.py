@@ -8,9 +8,9 @@ from pathlib import Path
 import av
 from av.error import FFmpegError
 
+from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.curate.pictures import VideoIndex, index_video
 from xop_lerobot.dataset.curate.source import EpisodeEntry, Source
-from xop_lerobot.errors import BadDataset
 
 _HEAD = 8
 """Bytes of the size and the name of a box."""

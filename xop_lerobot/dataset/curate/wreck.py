@@ -23,6 +23,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import write_tasks
 
+from xop_lerobot.core.errors import BadDataset
+from xop_lerobot.core.wording import say_count
 from xop_lerobot.dataset.curate.entries import (
     EPISODES_DIR,
     EpisodeEntry,
@@ -37,8 +39,6 @@ from xop_lerobot.dataset.curate.salvage import CannotSalvage, salvage
 from xop_lerobot.dataset.curate.source import Source
 from xop_lerobot.dataset.curate.task_words import TASKS_FILE, has_index_of_words, read_tasks
 from xop_lerobot.dataset.facts import FACTS_DIR
-from xop_lerobot.errors import BadDataset
-from xop_lerobot.wording import say_count
 
 _COUNTERS = ("episode_index", "frame_index", "task_index")
 # What reading a parquet file raises that is not what it should be; names may be no text.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.command import CommandDim, CommandSpace, Mode
+from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.g1.links import LINKS
 from xop_lerobot.morphology.g1.mpc import EFFECTS, STANDING_REACH, mpc_config
 from xop_lerobot.morphology.g1.shapes import FOOT_POINTS

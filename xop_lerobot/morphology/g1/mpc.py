@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.tuning import CostWeights, MpcConfig
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.command import CommandDim, CommandSpace, Mode
+from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.morphology import (
     MORPHOLOGIES,
     ArmChain,

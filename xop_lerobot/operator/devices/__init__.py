@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from xop_lerobot.core.registry import Registry
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices.config import DeviceConfig
-from xop_lerobot.registry import Registry
 
 DEVICES: Registry[Callable[[DeviceConfig], Device]] = Registry("device")
 """Devices by name, each made as ``factory(config)``."""

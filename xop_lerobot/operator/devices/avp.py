@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import grpc
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.operator.devices.address import find_own_address
 from xop_lerobot.operator.devices.avp_protocol import (
     METHOD,

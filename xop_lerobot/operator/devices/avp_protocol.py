@@ -13,9 +13,9 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError, Message
 
+from xop_lerobot.core.transforms import make_pose, quat_from_matrix
 from xop_lerobot.operator.devices.axes import WORLD
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.transforms import make_pose, quat_from_matrix
 
 SERVICE = "handtracking.HandTrackingService"
 METHOD = f"/{SERVICE}/StreamHandUpdates"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from xop_lerobot.command import Mode
-from xop_lerobot.errors import BadValue, UnknownName
-from xop_lerobot.yaml_words import fill_nulls
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.yaml_words import fill_nulls
 
 
 @dataclass

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.paced_log import PacedLog
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.one_euro import OneEuro, make_one_euro
 from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
 from xop_lerobot.operator.webxr.pairing import MAX_RATE
-from xop_lerobot.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
 

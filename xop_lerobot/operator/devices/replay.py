@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xop_lerobot.errors import BadValue, NotConnected
+from xop_lerobot.core.errors import BadValue, NotConnected
 from xop_lerobot.operator.dataset_recording import is_dataset, load_dataset_recording
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.config import DeviceConfig

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.errors import NotConnected
+from xop_lerobot.core.errors import NotConnected
+from xop_lerobot.core.transforms import (
+    make_pose,
+    quat_exp,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+)
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.player import Player
@@ -12,7 +19,6 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.operator.script import Script, load_script
-from xop_lerobot.transforms import make_pose, quat_exp, quat_from_yaw, quat_multiply, quat_rotate
 
 DEFAULT_SCRIPT = "g1_squat_walk_reach"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from xop_lerobot.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.config import DeviceConfig

@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from xop_lerobot.command_line import can_print_anything
-from xop_lerobot.errors import BadValue, XopError
+from xop_lerobot.core.command_line import can_print_anything
+from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.live import SILENT_S, LiveDevice, StreamStatus
 from xop_lerobot.operator.display import Display, Wish

@@ -7,11 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
-from xop_lerobot.operator.noise import HumanNoise
-from xop_lerobot.operator.simulated.person import Person
-from xop_lerobot.transforms import (
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -21,6 +17,10 @@ from xop_lerobot.transforms import (
     quat_multiply,
     quat_rotate,
 )
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
+from xop_lerobot.operator.noise import HumanNoise
+from xop_lerobot.operator.simulated.person import Person
 
 SIDES: tuple[str, str] = ("left", "right")
 OPEN, SHUT = 0.08, 0.008

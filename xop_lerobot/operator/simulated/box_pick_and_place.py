@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import quat_conjugate, quat_rotate, quat_yaw, wrap_angle
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.body import SIDES, TRUNK, relaxed_hands, stand_upright
 from xop_lerobot.operator.simulated.grasping import (
@@ -36,7 +37,6 @@ from xop_lerobot.operator.simulated.hands import (
 )
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
 from xop_lerobot.operator.simulated.walking import compute_miss, find, glance, go_to, set_mode
-from xop_lerobot.transforms import quat_conjugate, quat_rotate, quat_yaw, wrap_angle
 
 PRESS_MORE = 0.01
 """How much more they press after a box has slipped [m]."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.body import SIDES
 from xop_lerobot.operator.simulated.hands import (

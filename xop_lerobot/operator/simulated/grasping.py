@@ -8,6 +8,7 @@ from collections.abc import Generator
 
 import numpy as np
 
+from xop_lerobot.core.transforms import make_pose, quat_from_matrix, quat_yaw
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.simulated.body import SIDES
 from xop_lerobot.operator.simulated.hands import (
@@ -20,7 +21,6 @@ from xop_lerobot.operator.simulated.hands import (
     shift_hands,
 )
 from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.transforms import make_pose, quat_from_matrix, quat_yaw
 
 BESIDE = 0.06
 """Palms come so far beside the box before they close [m]."""

@@ -7,16 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from xop_lerobot.operator.simulated.body import (
-    HIPS_BACK,
-    NECK,
-    SIDES,
-    TRUNK,
-    Posture,
-    compute_sinking,
-)
-from xop_lerobot.operator.simulated.mind import Doing, Mind
-from xop_lerobot.transforms import (
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -27,6 +18,15 @@ from xop_lerobot.transforms import (
     quat_rotate,
     quat_to_rpy,
 )
+from xop_lerobot.operator.simulated.body import (
+    HIPS_BACK,
+    NECK,
+    SIDES,
+    TRUNK,
+    Posture,
+    compute_sinking,
+)
+from xop_lerobot.operator.simulated.mind import Doing, Mind
 
 MARGIN = 0.08
 """How far within the field of view a person wants to have what the hands work on [rad]."""

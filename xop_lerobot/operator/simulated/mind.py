@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_yaw, quat_multiply
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.noise import HumanNoise
@@ -15,7 +16,6 @@ from xop_lerobot.operator.simulated.body import SIDES, Body
 from xop_lerobot.operator.simulated.perception import Perception
 from xop_lerobot.operator.simulated.person import Person, draw_person
 from xop_lerobot.operator.view import View
-from xop_lerobot.transforms import make_pose, pose_multiply, quat_from_yaw, quat_multiply
 
 PALM = 0.1
 """From a person's wrist to the middle of the palm [m]."""

@@ -6,13 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import SIDES
-from xop_lerobot.operator.simulated.hands import take_posture
-from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.operator.simulated.walking import compute_miss, go_to, set_mode
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import (
     make_pose,
     quat_from_rpy,
     quat_from_yaw,
@@ -21,6 +16,11 @@ from xop_lerobot.transforms import (
     quat_yaw,
     wrap_angle,
 )
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.simulated.body import SIDES
+from xop_lerobot.operator.simulated.hands import take_posture
+from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
+from xop_lerobot.operator.simulated.walking import compute_miss, go_to, set_mode
 
 NOD = 0.25
 """How far the person nods to see the own palm [rad]."""

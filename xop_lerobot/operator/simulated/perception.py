@@ -6,11 +6,8 @@ from collections import deque
 
 import numpy as np
 
-from xop_lerobot.command import Mode
-from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.person import Person
-from xop_lerobot.operator.view import SeenObject, View
-from xop_lerobot.transforms import (
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import (
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -23,6 +20,9 @@ from xop_lerobot.transforms import (
     quat_to_rpy,
     wrap_angle,
 )
+from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.simulated.person import Person
+from xop_lerobot.operator.view import SeenObject, View
 
 WINDOW = 0.4
 """Time over which a person judges whether something moves [s]."""

@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.errors import XopError
 from xop_lerobot.operator.webxr.addresses import LOOPBACKS, list_addresses, list_names
 
 logger = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ import math
 import secrets
 from collections import OrderedDict, deque
 
-from xop_lerobot.errors import BadValue
+from xop_lerobot.core.errors import BadValue
 
 ALPHABET = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 """No letter looks like a digit."""

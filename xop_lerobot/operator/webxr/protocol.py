@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from xop_lerobot.core.transforms import make_pose, quat_from_matrix, quat_multiply, quat_rotate
 from xop_lerobot.operator.devices.axes import WORLD
 from xop_lerobot.operator.display import Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.stream_guard import NORM_TOLERANCE, OPEN_PINCH
-from xop_lerobot.transforms import make_pose, quat_from_matrix, quat_multiply, quat_rotate
 
 VERSION = 1
 PORT = 8012

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 from aiohttp import WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
+from xop_lerobot.core.paced_log import PacedLog
 from xop_lerobot.operator.display import Wish
 from xop_lerobot.operator.webxr.certificate import Certificate
 from xop_lerobot.operator.webxr.client import Client
@@ -27,7 +28,6 @@ from xop_lerobot.operator.webxr.protocol import (
     write_refused,
     write_welcome,
 )
-from xop_lerobot.paced_log import PacedLog
 
 logger = logging.getLogger(__name__)
 

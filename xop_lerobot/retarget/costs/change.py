@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from xop_lerobot.core.transforms import sum_squares
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import sum_squares
 
 
 class ChangeCost(Cost):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.morphology.tuning import CostWeights
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from xop_lerobot.core.transforms import quat_yaw, wrap_angle
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import quat_yaw, wrap_angle
 
 _LOOKING = 0.1  # speed at which the way to go and where the goal looks count alike [m/s]
 _REST, _FULL = 0.08, 0.2  # speeds of the head from which on the base is to face so [m/s]

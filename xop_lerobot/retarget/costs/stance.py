@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import sum_squares
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import sum_squares
 
 
 class StanceCost(Cost):

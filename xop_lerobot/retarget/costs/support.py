@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from xop_lerobot.core.transforms import quat_yaw, sum_squares
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.static_load import StaticLoad
-from xop_lerobot.transforms import quat_yaw, sum_squares
 
 GRAVITY = 9.81
 _VELOCITY_STEPS = 3  # control steps at the end of the horizon that give the velocity

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from xop_lerobot.core.transforms import compute_heading_squares, sum_squares
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import compute_heading_squares, sum_squares
 
 
 class TrackingCost(Cost):

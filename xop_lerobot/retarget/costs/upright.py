@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from xop_lerobot.core.transforms import make_pose, quat_exp, quat_multiply, quat_rotate, sum_squares
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
-from xop_lerobot.transforms import make_pose, quat_exp, quat_multiply, quat_rotate, sum_squares
 
 _UP = np.array([0.0, 0.0, 1.0])
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from xop_lerobot.command import Mode
+from xop_lerobot.core.command import Mode
 
 FRAMES = ("head", "left_wrist", "right_wrist")
 """Names of the frames an operator drives, in the order of every `tracked` flag."""

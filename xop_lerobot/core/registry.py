@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import cast
 
-from xop_lerobot.errors import DuplicateName, UnknownName
+from xop_lerobot.core.errors import DuplicateName, UnknownName
 
 
 class Registry[T]:

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from xop_lerobot.errors import BadShape, BadValue, UnknownName
+from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 
 
 class Mode(IntEnum):

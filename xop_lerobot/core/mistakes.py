@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
-from xop_lerobot.command_line import make_output_readable
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import XopError
 
 TRACEBACK_VARIABLE = "XOP_TRACEBACK"
 _COMMANDS = ("lerobot-", "lerobot_")

@@ -4,7 +4,7 @@ A worker is started once and does one job after another, so that imports are pai
 standard library's pools lose every pending job when one process dies, and do not say which job
 it was; here a new worker takes the dead one's place, and its job is done again, or comes back
 with an error. Workers are processes of this machine (`run_jobs`), or of many
-(`xop_lerobot.pool_ray`); what is common to both is `drive`.
+(`xop_lerobot.core.pool_ray`); what is common to both is `drive`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from multiprocessing.connection import wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from typing import TYPE_CHECKING, Any
 
-from xop_lerobot.errors import XopError
+from xop_lerobot.core.errors import XopError
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection

@@ -15,9 +15,8 @@ from collections.abc import Generator, Iterable, Sequence
 from textwrap import shorten
 from typing import Any
 
-from xop_lerobot.dataset.facts import read_versions
-from xop_lerobot.errors import XopError
-from xop_lerobot.pool import (
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.pool import (
     ENVIRONMENT,
     Crew,
     Function,
@@ -27,6 +26,7 @@ from xop_lerobot.pool import (
     do_job,
     drive,
 )
+from xop_lerobot.dataset.facts import read_versions
 
 LOCAL = "local"
 """Address that starts a cluster of this machine alone, for as long as the jobs take."""
@@ -51,7 +51,7 @@ def run_jobs_on_ray(
     address: str,
     tries: int = 1,
 ) -> Generator[JobResult]:
-    """Do `function(job)` for every job on a Ray cluster; see `xop_lerobot.pool.run_jobs`.
+    """Do `function(job)` for every job on a Ray cluster; see `xop_lerobot.core.pool.run_jobs`.
 
     Args:
         function: As there; its module can be imported on all machines.

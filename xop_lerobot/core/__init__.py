@@ -1,0 +1,1 @@
+"""Nouns that every part uses; it imports nothing of the others."""
