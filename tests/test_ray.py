@@ -14,9 +14,10 @@ from eval_jobs import do
 
 from xop_lerobot.core import pool_ray
 from xop_lerobot.core.pool_ray import OtherVersions, RayUnavailable, run_jobs_on_ray
+from xop_lerobot.core.versions import read_versions
 from xop_lerobot.dataset.collect import main as collect
 from xop_lerobot.dataset.curate.cli import main as curate
-from xop_lerobot.dataset.facts import read_facts, read_versions
+from xop_lerobot.dataset.facts import read_facts
 
 REPO = Path(__file__).parents[1]
 SETTINGS = (

@@ -12,9 +12,9 @@ from lerobot.robots.robot import Robot
 from lerobot_robot_xop.config_xop import XopG1Config, XopRby1Config, XopRobotConfig
 from xop_lerobot.core.errors import NotConnected, UnknownName
 from xop_lerobot.core.mistakes import report_mistakes
-from xop_lerobot.dataset.body import Body
 from xop_lerobot.link import Executed, RobotInfo, get_session
 from xop_lerobot.low_level.policy import make_policy, resolve_policy
+from xop_lerobot.morphology.body import Body
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_scene_spec
 from xop_lerobot.tasks.camera import add_task_camera

@@ -26,7 +26,7 @@ from xop_lerobot.core.pool import (
     do_job,
     drive,
 )
-from xop_lerobot.dataset.facts import read_versions
+from xop_lerobot.core.versions import read_versions
 
 LOCAL = "local"
 """Address that starts a cluster of this machine alone, for as long as the jobs take."""

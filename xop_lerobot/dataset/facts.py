@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -26,7 +24,6 @@ CONFIGS_DIR = FACTS_DIR / "configs"
 """Every configuration by its hash, where the episodes differ in it."""
 FACTS_PREFIX = "xop/"
 _JSON_FACTS = ("versions", "settings", "changes")
-_PACKAGES = ("lerobot_teleoperator_xop", "lerobot", "mujoco", "mink", "numpy", "onnxruntime")
 
 
 @dataclass(frozen=True)
@@ -181,15 +178,3 @@ def to_plain(value: Any) -> Any:  # any configuration value
     if isinstance(value, Enum):
         return value.name
     return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
-
-
-@cache
-def read_versions() -> str:
-    """Versions of the packages that decide what is recorded, as one JSON object."""
-    versions = {}
-    for name in _PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return json.dumps(versions)

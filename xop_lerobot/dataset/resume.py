@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, OBS_IMAGES, OBS_STATE
 
 from xop_lerobot.core.errors import XopError
-from xop_lerobot.dataset.body import Body
 from xop_lerobot.dataset.columns import is_own_column
+from xop_lerobot.morphology.body import Body
 
 if TYPE_CHECKING:
     from xop_lerobot.link import RobotInfo

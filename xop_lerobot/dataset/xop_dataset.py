@@ -24,6 +24,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from xop_lerobot.core.errors import BadDataset, BadValue, XopError
 from xop_lerobot.core.state import RobotState
+from xop_lerobot.core.versions import read_versions
 from xop_lerobot.dataset import durability
 from xop_lerobot.dataset.columns import Columns, has_all_columns, is_own_column
 from xop_lerobot.dataset.embedding import skip_embedding
@@ -35,7 +36,6 @@ from xop_lerobot.dataset.facts import (
     append_facts,
     compute_config_hash,
     keep_config,
-    read_versions,
     to_plain,
 )
 from xop_lerobot.dataset.resume import check_resumable

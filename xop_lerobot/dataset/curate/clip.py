@@ -103,7 +103,8 @@ class Step:
         """Make the step that is being done; arguments that are None or False are left out."""
         import json  # noqa: PLC0415
 
-        from xop_lerobot.dataset.facts import read_versions, to_plain  # noqa: PLC0415
+        from xop_lerobot.core.versions import read_versions  # noqa: PLC0415
+        from xop_lerobot.dataset.facts import to_plain  # noqa: PLC0415
 
         given = {key: value for key, value in arguments.items() if value not in (None, False)}
         return cls(verb, to_plain(given), json.loads(read_versions()))
