@@ -177,7 +177,7 @@ def add_device(delays: Delays, origin: Any) -> None:
 def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
     """Let the sender drive the robot in real time until it is gone."""
     from xop_lerobot.link import RobotInfo
-    from xop_lerobot.low_level.policy import make_policy
+    from xop_lerobot.low_level.factory import make_policy
     from xop_lerobot.morphology.morphology import make_morphology
     from xop_lerobot.operator.devices import DeviceConfig
     from xop_lerobot.plant.config import SimulationConfig

@@ -48,7 +48,8 @@ from xop_lerobot.low_level.comparison import (
     measure_speeds,
     replace_table,
 )
-from xop_lerobot.low_level.policy import LowLevelPolicy, list_policies, make_policy
+from xop_lerobot.low_level.factory import list_policies, make_policy
+from xop_lerobot.low_level.policy import LowLevelPolicy
 from xop_lerobot.morphology.morphology import make_morphology
 
 PARTS = ("speed", "commands", "arms", "sequences", "mpc")

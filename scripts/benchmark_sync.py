@@ -21,7 +21,8 @@ from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.state import RobotState
 from xop_lerobot.core.transforms import quat_yaw, wrap_angle
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop

@@ -28,7 +28,7 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.evaluation.tracking import WorldAlignment
 from xop_lerobot.link import RobotInfo
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.frame import OperatorFrame

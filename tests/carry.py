@@ -15,7 +15,7 @@ from xop_lerobot.core.transforms import (
     quat_from_rpy,
     quat_multiply,
 )
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.retarget.arm_driver import ArmDriver

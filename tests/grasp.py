@@ -9,7 +9,7 @@ import numpy as np
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.state import Goal
 from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_rotate
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.retarget.arm_driver import ArmDriver

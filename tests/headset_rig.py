@@ -16,7 +16,7 @@ from avp_server import wait_for
 from xop_lerobot.core.command import RobotAction
 from xop_lerobot.core.transforms import make_pose, quat_exp, quat_multiply
 from xop_lerobot.link import RobotInfo, TickRecord
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.devices.live import LiveDevice

@@ -10,7 +10,7 @@ import torch
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import PolicyFileError
 from xop_lerobot.core.transforms import quat_from_yaw
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 
 FILES = ("amo_jit.pt", "adapter_jit.pt", "adapter_norm_stats.pt")

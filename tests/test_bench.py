@@ -19,7 +19,8 @@ from xop_lerobot.evaluation.bench import (
     run_bench,
 )
 from xop_lerobot.evaluation.bench_report import KEYS, make_bench_blocks, summarise
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.rollout import PolicyRollout

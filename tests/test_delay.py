@@ -13,7 +13,8 @@ from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.state import Goal
 from xop_lerobot.core.transforms import make_pose, quat_from_yaw, rotation_error
 from xop_lerobot.link import RobotInfo
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.devices import DEVICES, DeviceConfig

@@ -11,7 +11,7 @@ import pytest
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.state import Goal
 from xop_lerobot.core.transforms import quat_from_rpy
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop

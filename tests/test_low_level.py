@@ -25,9 +25,10 @@ from xop_lerobot.low_level import policy_file
 from xop_lerobot.low_level.comparison import make_simulation
 from xop_lerobot.low_level.diff_drive import DiffDrive, compute_wheel_speeds
 from xop_lerobot.low_level.excitation import ExcitationConfig, make_excitation
+from xop_lerobot.low_level.factory import POLICIES, make_policy
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
-from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput, make_policy
+from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
 from xop_lerobot.low_level.tables import find_table, load_policy, read_table
 from xop_lerobot.low_level.trial import BatchSimulation, run_trials
 from xop_lerobot.morphology.morphology import make_morphology

@@ -13,7 +13,8 @@ from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.core.transforms import quat_from_yaw, quat_multiply, quat_rotate, rotation_error
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.rby1 import RBY1
 from xop_lerobot.morphology.scene import add_block, add_floor, build_model

@@ -13,7 +13,7 @@ from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import quat_exp, quat_from_rpy, quat_rotate
 from xop_lerobot.link import RobotInfo
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget import factory

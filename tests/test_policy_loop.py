@@ -15,12 +15,8 @@ from hypothesis import strategies as st
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.errors import BadShape, BadValue
 from xop_lerobot.low_level.diff_drive import DiffDrive
-from xop_lerobot.low_level.policy import (
-    POLICY_DT,
-    LowLevelPolicy,
-    PolicyOutput,
-    make_policy,
-)
+from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.plant import Measurement, Plant

@@ -20,9 +20,9 @@ from lerobot_robot_xop.config_xop import LowLevelConfig
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import PolicyFileError
 from xop_lerobot.low_level import tables
+from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.network_policy import MotorSet, NetworkPolicy, convert_targets
-from xop_lerobot.low_level.policy import make_policy, resolve_policy
 from xop_lerobot.low_level.tables import list_tables, load_policy
 from xop_lerobot.morphology.morphology import make_morphology
 

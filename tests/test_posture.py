@@ -12,7 +12,7 @@ import pytest
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_from_yaw, rotation_error
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.config import RetargeterConfig

@@ -9,7 +9,8 @@ import pytest
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.state import RobotState
-from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, make_policy
+from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.config import SimulationConfig

@@ -160,7 +160,7 @@ def test_offsets_and_facing_at_a_time(planner, rby1):
 
 
 def make_retargeter(bench_robot):
-    from xop_lerobot.low_level.policy import make_policy
+    from xop_lerobot.low_level.factory import make_policy
 
     policy = make_policy(bench_robot.policies[0], None)
     return MpcRetargeter(bench_robot, policy, build_model(bench_robot, "planning"))

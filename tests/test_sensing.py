@@ -8,7 +8,8 @@ import pytest
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.morphology.sensing import Sensing

@@ -13,7 +13,7 @@ import toy_robot
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.transforms import quat_exp, quat_multiply, quat_yaw, wrap_angle
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop

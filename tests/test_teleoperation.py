@@ -15,7 +15,7 @@ from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.state import FRAMES, Goal, RobotState
 from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_from_yaw, quat_rotate
 from xop_lerobot.link import RobotInfo, TickRecord
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.alignment import EngageRefused
 from xop_lerobot.operator.device import Device

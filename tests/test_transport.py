@@ -8,7 +8,7 @@ import pytest
 from carry import Carry
 
 from xop_lerobot.core.transforms import make_pose, quat_multiply
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.tasks import non_prehensile_transport as transport

@@ -16,7 +16,7 @@ from xop_lerobot.core.transforms import (
     quat_multiply,
     rotation_error,
 )
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop, limit_action

@@ -13,7 +13,8 @@ from toy_robot import Toy, make_teleop, make_toy
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy
+from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.display import Cue

@@ -22,7 +22,8 @@ from lerobot_robot_xop.config_xop import XopRobotConfig
 from lerobot_robot_xop.xop_robot import XopRobot
 from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
-from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput
+from xop_lerobot.low_level.factory import POLICIES
+from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
 from xop_lerobot.morphology.tuning import MpcConfig

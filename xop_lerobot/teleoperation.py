@@ -14,7 +14,7 @@ from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.errors import XopError
 from xop_lerobot.core.state import FRAMES, Goal, RobotState
 from xop_lerobot.link import RobotInfo, TickRecord
-from xop_lerobot.low_level.policy import make_policy
+from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.reach import compute_forward_reach
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig

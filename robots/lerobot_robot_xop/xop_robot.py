@@ -13,7 +13,7 @@ from lerobot_robot_xop.config_xop import XopG1Config, XopRby1Config, XopRobotCon
 from xop_lerobot.core.errors import NotConnected, UnknownName
 from xop_lerobot.core.mistakes import report_mistakes
 from xop_lerobot.link import Executed, RobotInfo, get_session
-from xop_lerobot.low_level.policy import make_policy, resolve_policy
+from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.body import Body
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_scene_spec

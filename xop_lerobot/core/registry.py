@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from typing import cast
 
 from xop_lerobot.core.errors import DuplicateName, UnknownName
@@ -13,10 +14,14 @@ class Registry[T]:
 
     Args:
         kind: What is registered, as it reads in an error (``"robot"``).
+        places: Where the things of this project are, as ``"module:attribute"`` by name. A module
+            is imported when its thing is first asked for, so a table costs nothing, and a thing
+            can import what has the table.
     """
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, places: Mapping[str, str] | None = None) -> None:
         self.kind = kind
+        self._places = dict(places or {})
         self._things: dict[str, T] = {}
 
     def add(self, name: str, thing: T) -> T:
@@ -25,7 +30,7 @@ class Registry[T]:
         Raises:
             DuplicateName: If the name is taken.
         """
-        if name in self._things:
+        if name in self:
             raise DuplicateName(self.kind, name)
         self._things[name] = thing
         return thing
@@ -40,7 +45,7 @@ class Registry[T]:
         return decorate
 
     def remove(self, name: str) -> None:
-        """Forget `name` (tests register toys and take them away again)."""
+        """Forget what was added under `name` (tests add toys and take them away again)."""
         self._things.pop(name, None)
 
     def __getitem__(self, name: str) -> T:
@@ -49,13 +54,15 @@ class Registry[T]:
         Raises:
             UnknownName: Carrying every known name.
         """
-        try:
-            return self._things[name]
-        except KeyError:
-            raise UnknownName(self.kind, name, self._things) from None
+        if name not in self:
+            raise UnknownName(self.kind, name, self)
+        if name not in self._things:
+            module, _, attribute = self._places[name].partition(":")
+            self._things[name] = getattr(import_module(module), attribute)
+        return self._things[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._things
+        return name in self._things or name in self._places
 
     def __iter__(self) -> Iterator[str]:
-        return iter(sorted(self._things))
+        return iter(sorted({*self._places, *self._things}))

@@ -34,7 +34,8 @@ from xop_lerobot.core.transforms import make_pose
 from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
 from xop_lerobot.evaluation.tracking_scenarios import bend_from, make_curve
 from xop_lerobot.link import RobotInfo
-from xop_lerobot.low_level.policy import POLICY_DT, make_policy, resolve_policy
+from xop_lerobot.low_level.factory import make_policy, resolve_policy
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.goal_velocity import GoalVelocity
 from xop_lerobot.plant.config import NOISE_PRESETS, SimulationConfig

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from xop_lerobot.core.errors import BadValue, PolicyFileError, UnknownName
-from xop_lerobot.low_level.policy import make_policy, resolve_policy
+from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig
 

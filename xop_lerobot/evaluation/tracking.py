@@ -39,7 +39,7 @@ from xop_lerobot.evaluation.tracking_setup import (
     resolve_configs,
 )
 from xop_lerobot.link import RobotInfo
-from xop_lerobot.low_level.policy import make_policy, resolve_policy
+from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig

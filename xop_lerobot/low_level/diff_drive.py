@@ -8,7 +8,7 @@ import numpy as np
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadShape, PolicyFileError
-from xop_lerobot.low_level.policy import POLICIES, LowLevelPolicy, PolicyOutput
+from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
@@ -104,9 +104,6 @@ class DiffDrive(LowLevelPolicy):
         targets[:, self._from_command[0]] = command[:, self._from_command[1]]
         targets[:, self._from_arms[0]] = arms[:, self._from_arms[1]]
         return PolicyOutput(np.clip(targets, self._low, self._high, out=targets), np.zeros((n, 0)))
-
-
-POLICIES.add("diff_drive", DiffDrive)
 
 
 def _pairs(

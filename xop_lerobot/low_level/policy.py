@@ -1,23 +1,19 @@
-"""The interface of a low-level policy π(x, a, h) and the registry of its implementations."""
+"""The interface of a low-level policy π(x, a, h)."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from types import ModuleType
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.errors import PolicyFileError, UnknownName
-from xop_lerobot.core.registry import Registry
 from xop_lerobot.low_level.rest import RestMap
 
 if TYPE_CHECKING:
     import mujoco
 
-    from xop_lerobot.morphology.morphology import Morphology
 
 POLICY_DT = 0.02
 """Period of every low-level policy [s] (50 Hz)."""
@@ -95,63 +91,3 @@ class LowLevelPolicy(ABC):
         Returns:
             Targets and the memory after the step; the inputs are left untouched.
         """
-
-
-POLICIES: Registry[Callable[..., LowLevelPolicy]] = Registry("low-level policy")
-"""Factories by name, called as ``factory(path=None)``: the tables that ship with the package, and
-the policies that are code."""
-
-
-def make_policy(name: str, path: str | None = None) -> LowLevelPolicy:
-    """Make the low-level policy `name`.
-
-    Args:
-        name: A registered name, for example ``"falcon"``, or the path of a table of your own,
-            ``"my_policy.toml"``, or of an ONNX file that describes itself.
-        path: The policy's file, or the folder of its files; None for its own default.
-
-    Raises:
-        UnknownName: Listing the known policies.
-        PolicyFileError: If the table or a file is missing, altered or of the wrong shape.
-    """
-    tables = _import_policies()
-    if tables.is_table(name):
-        return tables.load_policy(name, path)
-    return POLICIES[name](path=path)
-
-
-def list_policies(morphology: Morphology) -> tuple[str, ...]:
-    """Names of the policies that fit a robot; its own first."""
-    tables = _import_policies()
-    others = [name for name in tables.list_tables() if tables.find_robot(name) == morphology.name]
-    return (*morphology.policies, *(name for name in others if name not in morphology.policies))
-
-
-def resolve_policy(morphology: Morphology, name: str = "") -> str:
-    """Return the policy that `name` means for a robot: empty and ``"default"`` are its own.
-
-    Raises:
-        UnknownName: If it does not fit the robot, with those that do.
-        PolicyFileError: If it is the path of a table that is missing or malformed.
-    """
-    tables = _import_policies()
-    if tables.is_table(name):
-        robot = tables.find_robot(name)
-        if robot != morphology.name:
-            raise PolicyFileError(
-                f"policy table '{name}' is for robot '{robot}', not '{morphology.name}'"
-            )
-        return name
-    known = list_policies(morphology)
-    if name in known:
-        return name
-    if name in ("", "default"):
-        return known[0]
-    raise UnknownName(f"low-level policy of {morphology.name}", name, known)
-
-
-def _import_policies() -> ModuleType:
-    """Import all that registers itself; returns the module of the tables."""
-    from xop_lerobot.low_level import diff_drive, tables  # noqa: F401, PLC0415
-
-    return tables

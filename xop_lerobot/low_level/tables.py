@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -17,7 +16,6 @@ from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.network_policy import MotorSet, NetworkPolicy, Stage
 from xop_lerobot.low_level.network_stage import NetworkStage
 from xop_lerobot.low_level.networks import LoadedNetwork, ReferenceNetwork, load_network
-from xop_lerobot.low_level.policy import POLICIES
 from xop_lerobot.low_level.policy_file import FileFinder
 from xop_lerobot.morphology.morphology import list_robots
 
@@ -192,7 +190,3 @@ def _say_terms(table: d.PolicyTable) -> None:
     logger.info("%s: licence %s, %s", table.title, table.license, table.source)
     if table.terms:
         logger.warning("%s: %s", table.title, table.terms)
-
-
-for _name in list_tables():
-    POLICIES.add(_name, partial(load_policy, _name))

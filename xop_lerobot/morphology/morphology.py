@@ -188,13 +188,13 @@ class Morphology(ABC):
         )
 
 
-MORPHOLOGIES: Registry[type[Morphology]] = Registry("robot")
+MORPHOLOGIES: Registry[type[Morphology]] = Registry(
+    "robot", {"g1": "xop_lerobot.morphology.g1:G1", "rby1": "xop_lerobot.morphology.rby1:RBY1"}
+)
 
 
 def list_robots() -> tuple[str, ...]:
     """Names of the known robots."""
-    from xop_lerobot.morphology import g1, rby1  # noqa: F401, PLC0415
-
     return tuple(MORPHOLOGIES)
 
 
@@ -204,5 +204,4 @@ def make_morphology(name: str) -> Morphology:
     Raises:
         UnknownName: Listing the known robots.
     """
-    list_robots()
     return MORPHOLOGIES[name]()

@@ -8,7 +8,7 @@ import numpy as np
 
 from xop_lerobot.core.errors import BadShape
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.optimizer import OPTIMIZERS, Samples, SamplingOptimizer
+from xop_lerobot.retarget.optimizer import Samples, SamplingOptimizer
 from xop_lerobot.retarget.sampling import DRAWS
 from xop_lerobot.retarget.weighting import compute_effective_samples, compute_weights
 
@@ -17,7 +17,6 @@ __all__ = ["Kmppi", "Samples", "compute_effective_samples", "compute_weights"]
 _MAX_SHIFTS = 64
 
 
-@OPTIMIZERS.register("kmppi")
 class Kmppi(SamplingOptimizer):
     r"""Sampling optimizer of a command sequence :math:`A = W\,\theta`.
 

@@ -98,7 +98,10 @@ class SamplingOptimizer(ABC):
 Factory = Callable[[int, np.ndarray, np.ndarray, MpcConfig], SamplingOptimizer]
 """What `check_optimizer` takes: (horizon, low, high, config) -> optimizer; a class is one."""
 
-OPTIMIZERS: Registry[Factory] = Registry("optimizer")
+OPTIMIZERS: Registry[Factory] = Registry(
+    "optimizer",
+    {"cem": "xop_lerobot.retarget.cem:Cem", "kmppi": "xop_lerobot.retarget.kmppi:Kmppi"},
+)
 
 
 def build_optimizer(
@@ -109,9 +112,6 @@ def build_optimizer(
     Raises:
         UnknownName: Listing the known optimizers.
     """
-    # Implementations register themselves when they are imported.
-    from xop_lerobot.retarget import cem, kmppi  # noqa: F401, PLC0415
-
     return OPTIMIZERS[config.optimizer](horizon, low, high, config)
 
 

@@ -20,7 +20,7 @@ from xop_lerobot.tasks.layout import (
     measure_pad,
     measure_reach,
 )
-from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+from xop_lerobot.tasks.task import Task, TaskStatus
 from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
 
 if TYPE_CHECKING:
@@ -77,7 +77,6 @@ WOOD, STEEL, CARDBOARD = (0.72, 0.55, 0.38, 1), (0.35, 0.36, 0.38, 1), (0.78, 0.
 PALE, MARK, TAPE = (0.82, 0.80, 0.76, 1), (0.12, 0.55, 0.30, 1), (0.90, 0.84, 0.70, 1)
 
 
-@TASKS.register("box_pick_and_place")
 class BoxPickAndPlace(Task):
     """Squeeze a box between both hands, lift it, carry it to a table, put it down, let go.
 

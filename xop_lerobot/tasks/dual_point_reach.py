@@ -13,7 +13,6 @@ from xop_lerobot.tasks.furniture import place
 from xop_lerobot.tasks.heights import HeightRange
 from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import make_direction
-from xop_lerobot.tasks.task import TASKS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,7 +33,6 @@ LEVEL_SPREAD = 0.07
 """Largest difference of each point's height from the middle's [m]."""
 
 
-@TASKS.register("dual_point_reach")
 class DualPointReach(DualPointTouch):
     """Both palms within 5 cm of their own point, for 1 s without a break, standing.
 

@@ -14,7 +14,7 @@ from xop_lerobot.tasks.furniture import add_furniture_body, add_look, get_body_p
 from xop_lerobot.tasks.heights import HeightRange
 from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import find_palms, find_room, make_direction, measure_reach
-from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+from xop_lerobot.tasks.task import Task, TaskStatus
 
 if TYPE_CHECKING:
     import mujoco
@@ -52,7 +52,6 @@ RADIUS, ROD = 0.03, 1.5
 """Of the balls, and the length of the rods that they are on [m]."""
 
 
-@TASKS.register("dual_point_touch")
 class DualPointTouch(Task):
     """Both palms within 5 cm of their own point, for 3 s without a break.
 

@@ -21,7 +21,7 @@ from xop_lerobot.operator.view import SeenObject
 from xop_lerobot.tasks import furniture, palm
 from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import find_palms, make_direction, measure_pad, measure_reach
-from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+from xop_lerobot.tasks.task import Task, TaskStatus
 from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
 
 if TYPE_CHECKING:
@@ -71,7 +71,6 @@ ORANGE, BLUE = (0.96, 0.62, 0.10, 1), (0.25, 0.45, 0.72, 1)
 RED, STEEL = (0.78, 0.28, 0.22, 1), (0.35, 0.36, 0.38, 1)
 
 
-@TASKS.register("non_prehensile_transport")
 class NonPrehensileTransport(Task):
     """Carry a toy that lies loose on the open left palm over obstacles, and drop it into a box.
 

@@ -147,7 +147,17 @@ class Task(ABC):
         """What a person can see of the task, by name."""
 
 
-TASKS: Registry[type[Task]] = Registry("task")
+TASKS: Registry[type[Task]] = Registry(
+    "task",
+    {
+        "box_pick_and_place": "xop_lerobot.tasks.box_pick_and_place:BoxPickAndPlace",
+        "dual_point_reach": "xop_lerobot.tasks.dual_point_reach:DualPointReach",
+        "dual_point_touch": "xop_lerobot.tasks.dual_point_touch:DualPointTouch",
+        "non_prehensile_transport": (
+            "xop_lerobot.tasks.non_prehensile_transport:NonPrehensileTransport"
+        ),
+    },
+)
 
 
 def make_task(name: str, morphology: Morphology, heights: str = "") -> Task:
@@ -173,11 +183,4 @@ def get_task(name: str) -> type[Task]:
     Raises:
         UnknownName: Listing the known tasks.
     """
-    from xop_lerobot.tasks import (  # noqa: F401, PLC0415 they register themselves
-        box_pick_and_place,
-        dual_point_reach,
-        dual_point_touch,
-        non_prehensile_transport,
-    )
-
     return TASKS[name]

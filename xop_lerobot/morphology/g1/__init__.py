@@ -10,7 +10,7 @@ from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.g1.links import LINKS
 from xop_lerobot.morphology.g1.mpc import EFFECTS, STANDING_REACH, mpc_config
 from xop_lerobot.morphology.g1.shapes import FOOT_POINTS
-from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
+from xop_lerobot.morphology.morphology import ArmChain, ModelKind, Morphology
 
 if TYPE_CHECKING:
     import mujoco
@@ -41,7 +41,6 @@ def _mirrored(side: str, joint: str, angle: float) -> float:
     return -angle if side == "right" and joint.endswith(("roll", "yaw")) else angle
 
 
-@MORPHOLOGIES.register("g1")
 class G1(Morphology):
     """G1: a biped whose legs and waist a whole-body policy drives."""
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.morphology import (
-    MORPHOLOGIES,
     ArmChain,
     ModelKind,
     Morphology,
@@ -63,7 +62,6 @@ def _make_torso_dims() -> tuple[CommandDim, ...]:
     return tuple(dims)
 
 
-@MORPHOLOGIES.register("rby1")
 class RBY1(Morphology):
     """RB-Y1 with the command space V1: base velocity and torso joints."""
 

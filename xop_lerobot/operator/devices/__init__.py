@@ -8,23 +8,17 @@ from xop_lerobot.core.registry import Registry
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices.config import DeviceConfig
 
-DEVICES: Registry[Callable[[DeviceConfig], Device]] = Registry("device")
+DEVICES: Registry[Callable[[DeviceConfig], Device]] = Registry(
+    "device",
+    {
+        "avp": "xop_lerobot.operator.devices.avp:AvpDevice",
+        "replay": "xop_lerobot.operator.devices.replay:ReplayDevice",
+        "scripted": "xop_lerobot.operator.devices.scripted:ScriptedDevice",
+        "simulated": "xop_lerobot.operator.devices.simulated:SimulatedDevice",
+        "webxr": "xop_lerobot.operator.devices.webxr:WebXrDevice",
+    },
+)
 """Devices by name, each made as ``factory(config)``."""
-
-
-@DEVICES.register("avp")
-def _make_avp(config: DeviceConfig) -> Device:
-    # gRPC starts threads of its own; who needs no headset shall not have them.
-    from xop_lerobot.operator.devices.avp import AvpDevice  # noqa: PLC0415
-
-    return AvpDevice(config)
-
-
-@DEVICES.register("webxr")
-def _make_webxr(config: DeviceConfig) -> Device:
-    from xop_lerobot.operator.devices.webxr import WebXrDevice  # noqa: PLC0415
-
-    return WebXrDevice(config)
 
 
 def make_device(config: DeviceConfig) -> Device:
@@ -34,9 +28,6 @@ def make_device(config: DeviceConfig) -> Device:
         UnknownName: Listing the available devices.
         BadValue: If a setting is out of its range, or one that the device needs is absent.
     """
-    # Implementations register themselves when they are imported.
-    from xop_lerobot.operator.devices import replay, scripted, simulated  # noqa: F401, PLC0415
-
     return DEVICES[config.type](config)
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from xop_lerobot.core.errors import BadValue, NotConnected
 from xop_lerobot.operator.dataset_recording import is_dataset, load_dataset_recording
-from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.player import Player
 from xop_lerobot.operator.frame import OperatorFrame
@@ -67,6 +66,3 @@ class ReplayDevice(Player):
     def is_paused(self, time: float) -> bool:
         """Whether the person of the recording had let go of their robot."""
         return not self.recording.is_engaged_at(self.elapsed(time))
-
-
-DEVICES.add("replay", ReplayDevice)

@@ -12,7 +12,6 @@ from xop_lerobot.core.transforms import (
     quat_multiply,
     quat_rotate,
 )
-from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.player import Player
 from xop_lerobot.operator.frame import OperatorFrame
@@ -86,6 +85,3 @@ class ScriptedDevice(Player):
             # A script that states modes states them from the beginning.
             mode=self.start_mode if mode is None and script.modes else mode,
         )
-
-
-DEVICES.add("scripted", ScriptedDevice)

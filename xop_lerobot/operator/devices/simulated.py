@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.operator.device import Device
-from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.simulated.intentions import INTENTIONS, PREPARATIONS
@@ -108,6 +107,3 @@ class SimulatedDevice(Device):
             raise GaveUp("it takes too long")
         except GaveUp as reason:
             mind.note(f"gave up: {reason}")
-
-
-DEVICES.add("simulated", SimulatedDevice)
