@@ -19,6 +19,7 @@ from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.retarget.arm_driver import ArmDriver
+from xop_lerobot.tasks.non_prehensile_transport import NonPrehensileTransport
 from xop_lerobot.tasks.palm import PALM_UP
 from xop_lerobot.tasks.stage import Stage
 
@@ -75,15 +76,17 @@ class Carry:
 
     def deliver(self) -> None:
         """Level, over the obstacle, beside the opening, roll."""
-        seen, hints = self.stage.task.objects, self.stage.task.hints
+        task = self.stage.task
+        assert isinstance(task, NonPrehensileTransport)
+        seen, hints = task.objects, task.hints
         opening, obstacle = seen["opening"].pose[:3], seen["obstacle_0"]
         over = obstacle.pose[2] + obstacle.size[2] + 0.09
-        start = self.stage.task.start_palm
+        start = task.start_palm
         self.move(start, 1.0)
         self.move(start, 4.0)
-        self.move([start[0], start[1], over], 1.5)
+        self.move(np.array([start[0], start[1], over]), 1.5)
         beside = opening + [-hints["toy_forward"], hints["edge"] + 0.01, 0.0]
-        self.move([beside[0], beside[1], over], 3.0)
+        self.move(np.array([beside[0], beside[1], over]), 3.0)
         self.move(beside + [0, 0, 0.08 - hints["toy_over"] + 0.03], 1.5)
         self.move(self.position, 0.5)
         self.move(self.position, 1.2, math.radians(50))

@@ -14,7 +14,7 @@ from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.retarget.arm_driver import ArmDriver
 from xop_lerobot.tasks import furniture
-from xop_lerobot.tasks.box_pick_and_place import BOX, SPOT, SUPPORT
+from xop_lerobot.tasks.box_pick_and_place import BOX, SPOT, SUPPORT, BoxPickAndPlace
 from xop_lerobot.tasks.stage import Stage
 
 DT = 0.02
@@ -50,7 +50,9 @@ class Grasp:
             self.morphology, self.stage.plant, make_policy(policy or self.morphology.policies[0])
         )
         self.driver = ArmDriver(self.morphology)
-        self.hints = self.stage.task.hints
+        task = self.stage.task
+        assert isinstance(task, BoxPickAndPlace)
+        self.task, self.hints = task, task.hints
         self.press = self.hints["press"] if press is None else press
         self.loop.reset(0)
         self.stage.reset(0)
@@ -69,7 +71,7 @@ class Grasp:
                 self.to_wrist[side] = np.array([-0.1, 0, 0.013])
 
     def _put_support(self, ahead: float) -> None:
-        task, plant = self.stage.task, self.stage.plant
+        task, plant = self.task, self.stage.plant
         self.middle = np.array([task.reach.forward + ahead, 0, task.reach.height])
         top = self.middle - [0, 0, BOX[2]] + [SUPPORT[0] - BOX[0] - SPOT, 0, 0]
         furniture.place(plant, "support", top, NO_TURN)
@@ -89,7 +91,7 @@ class Grasp:
         action = self.loop.execute(RobotAction(command, Mode.STATIONARY, arms), DT)
         self.driver.note(action.arms)
         self.stage.update()
-        plant, task = self.stage.plant, self.stage.task
+        plant, task = self.stage.plant, self.task
         self.log.box.append(plant.get_object_pose("box"))
         self.log.speed.append(self.stage.status.figures["speed_m_s"])
         self.log.touched.append(task._touching.find())

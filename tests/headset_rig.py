@@ -14,6 +14,7 @@ import numpy as np
 from avp_server import wait_for
 
 from xop_lerobot.core.command import RobotAction
+from xop_lerobot.core.state import Goal
 from xop_lerobot.core.transforms import make_pose, quat_exp, quat_multiply
 from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.factory import make_policy
@@ -52,6 +53,12 @@ def make_person(t: float, gesture: bool) -> OperatorFrame:
 def pass_on(t: float, frame: OperatorFrame) -> list[OperatorFrame]:
     del t
     return [frame]
+
+
+def get_goal(record: TickRecord) -> Goal:
+    """The goal of a tick in which the operator drives."""
+    assert record.goal is not None
+    return record.goal
 
 
 class Rig:
@@ -135,10 +142,10 @@ class Rig:
 
     def assert_left_arm_stood(self, ticks: slice) -> None:
         """The left hand's goal stood still beside the head, while the right one's moved."""
-        goals = [record.goal for _, record in self.ticks[ticks]]
+        poses = [get_goal(record).poses for _, record in self.ticks[ticks]]
         spans = {}
         for name in ("left_wrist", "right_wrist"):
-            offsets = np.array([g.poses[name][:3] - g.poses["head"][:3] for g in goals])
+            offsets = np.array([each[name][:3] - each["head"][:3] for each in poses])
             spans[name] = np.ptp(offsets, axis=0).max()
         assert spans["left_wrist"] < 0.01  # it turns with the head
         assert spans["right_wrist"] > 0.03

@@ -48,8 +48,9 @@ def make_frame(rng: np.random.Generator, head: np.ndarray, **fields: object) -> 
 
 
 def make_head(rng: np.random.Generator) -> np.ndarray:
-    rpy = (*rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3))
-    return make_pose(np.array([*rng.uniform(-3, 3, 2), rng.uniform(1, 1.9)]), quat_from_rpy(*rpy))
+    roll, pitch = rng.uniform(-0.5, 0.5, 2)
+    turn = quat_from_rpy(roll, pitch, rng.uniform(-3, 3))
+    return make_pose(np.array([*rng.uniform(-3, 3, 2), rng.uniform(1, 1.9)]), turn)
 
 
 def make_robot(rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -309,7 +310,7 @@ def test_velocity_follows_a_first_order_lag_at_any_rate(rate: int) -> None:
 
 
 def test_repeated_stamps_gaps_and_resets() -> None:
-    estimator = GoalVelocity()
+    estimator, velocity = GoalVelocity(), np.zeros(6)
     for i in range(50):
         velocity = estimator.update(i / 25, pose_at(i / 25))["head"]
         again = estimator.update(i / 25, pose_at(i / 25))["head"]

@@ -93,7 +93,7 @@ def assert_within_limits(a: Arms, before: np.ndarray, after: np.ndarray, dt: flo
 def test_a_reachable_goal_is_reached(arms, solvers, name, seed):
     a, ik = arms[name], solvers[name]
     goals = a.compute_wrists(a.draw_reachable(seed))
-    angles, errors = a.rest, []
+    angles, wrists, errors = a.rest, {}, []
     for _ in range(75):
         before, angles = angles, ik.solve(a.qpos, angles, goals, DT)
         assert_within_limits(a, before, angles, DT)
@@ -307,7 +307,8 @@ def test_no_time_no_motion(arms, solvers, name):
 def test_inputs_are_left_untouched(arms, solvers, name):
     a, ik = arms[name], solvers[name]
     goals = a.compute_wrists(a.draw_reachable(7))
-    goals["left_wrist"][3:] = quat_multiply(quat_exp([0.1, 0, 0]), goals["left_wrist"][3:])
+    turn = quat_exp(np.array([0.1, 0, 0]))
+    goals["left_wrist"][3:] = quat_multiply(turn, goals["left_wrist"][3:])
     frozen = [a.qpos.copy(), a.rest.copy(), *(goal.copy() for goal in goals.values())]
     ik.solve(a.qpos, a.rest, goals, DT)
     for now, before in zip([a.qpos, a.rest, *goals.values()], frozen, strict=True):

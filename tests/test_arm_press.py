@@ -118,7 +118,7 @@ def test_what_is_smoothed_does_not_tremble_with_the_head_that_was_measured():
     hold, rng = ArmHold(), np.random.default_rng(0)
     steady = make_pose(np.array([0, 0, 1.2]), NO_TURN)
     hold.update(SQUEEZE, RIGHT - LEFT)
-    heights = []
+    head, heights = steady, []
     for _ in range(200):
         head = steady + [0, 0, rng.normal(0, 0.005), 0, 0, 0, 0]
         heights.append(hold.smooth(GOALS, head, steady, DT)["left_wrist"][2])
@@ -131,6 +131,7 @@ def test_what_is_smoothed_does_not_tremble_with_the_head_that_was_measured():
 
 def test_hands_that_squeeze_too_hard_give_way_until_they_do_not():
     stiffness, inside, felt, hands = 1e4, 0.01, 0.0, ArmYield()  # 100 N if nothing gave way
+    force = 0.0
     for _ in range(200):
         force = stiffness * (inside - hands.way)
         felt += -np.expm1(-DT / 0.3) * (force - felt)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -98,7 +99,7 @@ def test_weights_are_checked_by_name_and_range():
         Change(weights={name: 0.5})
         for bad in (-1, float("nan"), 1e7, "much", None, True):
             with pytest.raises(BadValue, match=f"weight '{name}' must be a number"):
-                Change(weights={name: bad})
+                Change(weights={name: cast(Any, bad)})
 
 
 # -- presets -------------------------------------------------------------------------------
@@ -363,7 +364,7 @@ def assert_smooth(r: Rig, commands: list[np.ndarray], arms: list[np.ndarray]) ->
     max_examples=3,
     deadline=None,
     derandomize=True,
-    suppress_health_check=list(HealthCheck),
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(data=st.lists(changes, min_size=8, max_size=8))
 def test_no_change_makes_a_step(person, robot, data):  # noqa: F811
@@ -415,8 +416,9 @@ def test_a_hand_that_is_freed_from_a_constraint_turns_to_its_goal_slowly(rig):  
 
     r.person.motion = motion
     r.teleop.change({"variant": "v2", "constraints": {"upright": True}})
-    for _ in range(40):
-        _, record = r.tick()
+    r.run(39 * r.dt)
+    _, record = r.tick()
+    assert record.goal is not None
     held = r.teleop._compute_frames(record.state)["left_wrist"]
     asked = record.goal.poses["left_wrist"]
     assert np.linalg.norm(rotation_error(asked[3:], held[3:])) > 0.4

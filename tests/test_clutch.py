@@ -48,7 +48,7 @@ def drive(frames, clutch: Clutch | None = None, engaged: bool = False, grants: b
 def hold(*spans: tuple[float, float], rate: float = 50, end: float = 6.0, **fields):
     """Frames of somebody who makes the gesture in the `spans`."""
     return [
-        make_frame(t, closed=any(a <= t < b for a, b in spans), **fields)
+        make_frame(float(t), closed=any(a <= t < b for a, b in spans), **fields)
         for t in np.arange(0, end, 1 / rate)
     ]
 

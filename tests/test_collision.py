@@ -46,7 +46,7 @@ def test_collision_equals_its_formula(cut_off):
 
     expected = []
     for i in range(K):
-        total = 0.0
+        total = speed = 0.0
         for k in range(1, H + 1):
             speed = e.qvel[i, k, 0] ** 2 + e.qvel[i, k, 1] ** 2
             total += compute_barrier({s: e.points[s][i, k] for s in RADII}, speed) / H

@@ -242,7 +242,7 @@ def test_bad_commands_are_refused(command, error, text):
 
 
 def test_check_vector_makes_floats():
-    assert check_vector("ints", [1, 2], 2).dtype == float
+    assert check_vector("ints", np.array([1, 2]), 2).dtype == float
 
 
 def test_columns_follow_the_order_and_are_read_only():

@@ -120,7 +120,7 @@ def test_terminal_equals_its_formula():
 
 def test_tracking_by_hand():
     """0.1 m off in position all along costs 0.01; the start, which nothing can change, nothing."""
-    goal = make_pose([1.0, 0, 1.2], quat_from_yaw(0.3))
+    goal = make_pose(np.array([1.0, 0, 1.2]), quat_from_yaw(0.3))
     poses = np.tile(goal, (1, H + 1, 1))
     poses[:, 1:, 1] += 0.1
     poses[:, 0, :3] += 100
@@ -133,9 +133,9 @@ def test_tracking_by_hand():
 
 @pytest.mark.parametrize("axis, share", [(0, 0.3), (1, 0.3), (2, 1.0)])
 def test_a_tilt_counts_less_than_a_turn(axis, share):
-    goal = make_pose([0, 0, 1], quat_from_yaw(0.8))
+    goal = make_pose(np.array([0, 0, 1]), quat_from_yaw(0.8))
     turn = quat_exp(0.2 * np.eye(3)[axis])
-    pose = make_pose([0, 0, 1], quat_multiply(goal[3:], turn))
+    pose = make_pose(np.array([0, 0, 1]), quat_multiply(goal[3:], turn))
     e = make_evaluation(terminal_poses={"head": pose[None]}, terminal_goals={"head": goal})
     e = dataclasses.replace(e, qpos=e.qpos[:1])
     expected = WEIGHTS.terminal * WEIGHTS.orientation * share * 0.2**2
@@ -231,7 +231,7 @@ def test_the_reference_costs_nothing():
 
 
 def base_at(x: float, y: float, yaw: float) -> np.ndarray:
-    return make_pose([x, y, 0.4], quat_from_yaw(yaw))
+    return make_pose(np.array([x, y, 0.4]), quat_from_yaw(yaw))
 
 
 @pytest.mark.parametrize(
@@ -255,8 +255,8 @@ def test_excess_over_each_edge_by_hand(point, excess, base):
 
 def test_excess_does_not_change_when_the_base_tilts_forward():
     """Only place and heading of the base count: the area lies on the ground."""
-    tilted = make_pose([1, 2, 0.4], quat_from_rpy(0.0, 0.3, 0.5))
-    level = make_pose([1, 2, 0.4], quat_from_yaw(0.5))
+    tilted = make_pose(np.array([1, 2, 0.4]), quat_from_rpy(0.0, 0.3, 0.5))
+    level = make_pose(np.array([1, 2, 0.4]), quat_from_yaw(0.5))
     area, point = SupportArea(SQUARE), np.array([1.5, 2.1])
     np.testing.assert_allclose(
         area.compute_excess(tilted, point), area.compute_excess(level, point)
@@ -370,28 +370,29 @@ def evaluate_fall(pose: np.ndarray) -> float:
 def test_fall_counts_tilt_beyond_half_the_limit(yaw):
     for roll, pitch in ((0, 0), (0.39, 0), (0, -0.39)):
         quat = quat_multiply(quat_from_yaw(yaw), quat_from_rpy(roll, pitch, 0))
-        assert evaluate_fall(make_pose([0, 0, 0.75], quat)) == 0
+        assert evaluate_fall(make_pose(np.array([0, 0, 0.75]), quat)) == 0
     quat = quat_multiply(quat_from_yaw(yaw), quat_from_rpy(0, 0.6, 0))
-    assert evaluate_fall(make_pose([0, 0, 0.75], quat)) == pytest.approx(10 * 0.2**2)
+    assert evaluate_fall(make_pose(np.array([0, 0, 0.75]), quat)) == pytest.approx(10 * 0.2**2)
 
 
 def test_fall_counts_height_under_the_last_quarter():
     upright = np.array([1.0, 0, 0, 0])
-    assert evaluate_fall(make_pose([0, 0, 0.46], upright)) == 0
-    assert evaluate_fall(make_pose([0, 0, 0.35], upright)) == pytest.approx(10 * 0.1**2)
+    assert evaluate_fall(make_pose(np.array([0, 0, 0.46]), upright)) == 0
+    assert evaluate_fall(make_pose(np.array([0, 0, 0.35]), upright)) == pytest.approx(10 * 0.1**2)
 
 
 def test_fall_does_not_count_what_a_robot_that_squats_does():
     """It rests low, and leans as its policy does under the executed command."""
     cost = FallCost(0.8, 0.35, 0.75, lowest=0.42, compute_rest_tilt=lambda _command, _mode: 0.5)
     for height, pitch, excess in ((0.42, 0.5, 0.0), (0.42, 0.7, 0.05), (0.37, 0.5, 0.015)):
-        pose = make_pose([0, 0, height], quat_from_rpy(0, pitch, 0))
+        pose = make_pose(np.array([0, 0, height]), quat_from_rpy(0, pitch, 0))
         e = make_evaluation(qpos=np.tile(pose, (1, H + 1, 1)), weights=CostWeights(fall=10.0))
         assert cost.compute(e)[0] == pytest.approx(10 * excess**2)
 
 
 def test_fall_does_not_count_the_start():
-    e = make_evaluation(qpos=np.tile(make_pose([0, 0, 0.75], [1, 0, 0, 0]), (1, H + 1, 1)))
+    upright = np.array([0, 0, 0.75, 1, 0, 0, 0])
+    e = make_evaluation(qpos=np.tile(upright, (1, H + 1, 1)))
     e.qpos[:, 0, 2] = -5
     np.testing.assert_array_equal(FallCost(0.8, 0.35, 0.75).compute(e), [0])
 

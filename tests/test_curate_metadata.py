@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -42,7 +43,7 @@ def single(bases, tmp_path) -> Path:
     return root
 
 
-def edit(root: Path, changes: dict[str, dict[int, object]], drop: tuple[int, ...] = ()) -> None:
+def edit(root: Path, changes: dict[str, dict[int, Any]], drop: tuple[int, ...] = ()) -> None:
     """Set cells of the metadata, column -> episode -> value, and drop rows, all in one file then.
 
     A column of whole numbers becomes one of floats by a NaN, as in pandas.

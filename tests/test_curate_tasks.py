@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from curate_data import make_foreign, make_synthetic
 from lerobot.datasets import LeRobotDataset
+from lerobot_rows import get_episodes, get_row
 
 from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.dataset.curate.cli import main
@@ -35,7 +36,7 @@ TABLES = {
         pd.DataFrame({"task_index": [0, 1], "task": WORDS})
     ),
     "an index without a name": pa.Table.from_pandas(
-        pd.DataFrame({"task_index": [0, 1]}, index=WORDS)
+        pd.DataFrame({"task_index": [0, 1]}, index=pd.Index(WORDS))
     ),
 }
 VERBS = {
@@ -60,9 +61,9 @@ def data(foreign, tmp_path) -> Path:
 def read_words(root: Path) -> list[list[str]]:
     """Each episode's words: as the metadata says, and as LeRobot shows its first row."""
     dataset = LeRobotDataset("local/out", root=root)
-    starts = dataset.meta.episodes["dataset_from_index"]
-    shown = [dataset[int(start)]["task"] for start in starts]
-    listed = [tasks for tasks in dataset.meta.episodes["tasks"]]
+    episodes = get_episodes(dataset)
+    shown = [get_row(dataset, int(start))["task"] for start in episodes["dataset_from_index"]]
+    listed = [tasks for tasks in episodes["tasks"]]
     assert listed == [[words] for words in shown]
     return listed
 

@@ -97,13 +97,19 @@ def test_latency_is_the_median_in_control_steps():
     assert meter.steps == 0
 
 
+def predict(plan: StampedPlan, time: float) -> np.ndarray:
+    velocity = plan.predict_velocity(time)
+    assert velocity is not None
+    return velocity
+
+
 def test_a_plan_tells_the_velocity_that_it_predicts():
     velocities = np.outer(np.arange(4), [1.0, 2.0, 3.0])
     plan = make_plan(1.0, velocities=velocities)
-    np.testing.assert_allclose(plan.predict_velocity(1.0), [0, 0, 0])
-    np.testing.assert_allclose(plan.predict_velocity(1.03), [1.5, 3, 4.5])
-    np.testing.assert_allclose(plan.predict_velocity(1.06), [3, 6, 9])
-    np.testing.assert_allclose(plan.predict_velocity(1.06 + 1e-9), [3, 6, 9])
+    np.testing.assert_allclose(predict(plan, 1.0), [0, 0, 0])
+    np.testing.assert_allclose(predict(plan, 1.03), [1.5, 3, 4.5])
+    np.testing.assert_allclose(predict(plan, 1.06), [3, 6, 9])
+    np.testing.assert_allclose(predict(plan, 1.06 + 1e-9), [3, 6, 9])
     assert plan.predict_velocity(0.98) is None
     assert plan.predict_velocity(1.08) is None
     assert make_plan(1.0).predict_velocity(1.0) is None
@@ -195,8 +201,10 @@ def follow(robot: str, delay: float, seed: int = 0, seconds: float = 5.0, *, com
         teleop = Teleoperation(config, info)
     finally:
         DEVICES.remove("walker")
-    follower = teleop._follower
-    real, predictor = follower.background, follower.background._predictor
+    follower, person = teleop._follower, teleop.device
+    real = follower.background
+    assert real is not None
+    predictor = real._predictor
     real.close()
     late = follower.background = LatePlanner(
         teleop.retargeter, predictor if compensate else None, delay
@@ -208,7 +216,8 @@ def follow(robot: str, delay: float, seed: int = 0, seconds: float = 5.0, *, com
         head = (0.3 * np.sin(1.2 * (t - begin)), 0.0, 1.7)
         return make_frame(t, head, 0.3 * np.sin(t - begin), mode=Mode.MOBILE)
 
-    teleop.device.motion = motion
+    assert isinstance(person, Person)
+    person.motion = motion
     errors, records = [], []
     for _ in range(round(seconds / 0.04)):
         state = loop.state
@@ -216,6 +225,7 @@ def follow(robot: str, delay: float, seed: int = 0, seconds: float = 5.0, *, com
         action, record = teleop.step(state)
         loop.execute(action, 0.04)
         head = teleop._compute_frames(state)["head"]
+        assert record.goal is not None
         goal = record.goal.poses["head"]
         errors.append(np.linalg.norm(head[:3] - goal[:3]))
         records.append((state, action, record, follower.current))

@@ -32,7 +32,7 @@ def run(
     """Stamps of the toggles in a stream whose `hand` is closed during `taps` (start, end)."""
     detector = DoublePinchDetector()
     toggles = []
-    for time in np.arange(shift, length, 1 / rate):
+    for time in np.arange(shift, length, 1 / rate).tolist():
         pinch = np.full(2, 0.08)
         for start, end in taps:
             # Fingers need 40 ms to close and to open.
@@ -122,7 +122,7 @@ def test_a_clock_that_goes_back_starts_anew() -> None:
     detector = DoublePinchDetector()
     for _ in range(2):
         toggles = 0
-        for time in np.arange(0, 2.5, 1 / 50):
+        for time in np.arange(0, 2.5, 1 / 50).tolist():
             closed = any(start <= time < end for start, end in DOUBLE)
             pinch = np.array([0.01 if closed else 0.08, 0.08])
             toggles += detector.update(OperatorFrame(time, POSE, POSE, POSE, pinch))
@@ -149,7 +149,7 @@ def test_real_motion_makes_no_toggle(hand: str) -> None:
     for file in files:
         recording = load_recording(file)
         detector = DoublePinchDetector(DoublePinchConfig(hand=hand))
-        times = np.arange(0, recording.duration + 1, 1 / 90)
+        times = np.arange(0, recording.duration + 1, 1 / 90).tolist()
         assert not any(detector.update(recording.frame_at(time)) for time in times)
 
 

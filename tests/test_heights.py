@@ -16,6 +16,7 @@ from xop_lerobot.evaluation.eval_cli import main
 from xop_lerobot.evaluation.study import compute_key
 from xop_lerobot.evaluation.trial import TrialSetup
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.tasks.dual_point_touch import DualPointTouch
 from xop_lerobot.tasks.heights import parse_heights
 from xop_lerobot.tasks.layout import make_direction
 from xop_lerobot.tasks.stage import Stage
@@ -97,9 +98,10 @@ def test_both_points_are_within_the_range(robot, low, high):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_height_that_may_be_asked_for_is_in_reach(robot):
     morphology = make_morphology(robot)
-    stage = Stage(morphology, TOUCH)
-    for height in stage.task.height_limits["points"]:
-        middle = stage.task.reach.forward * make_direction(0.0) + [0, 0, height]
+    task = Stage(morphology, TOUCH).task
+    assert isinstance(task, DualPointTouch)
+    for height in task.height_limits["points"]:
+        middle = task.reach.forward * make_direction(0.0) + [0, 0, height]
         points = {"left_palm": middle + [0, 0.18, 0], "right_palm": middle - [0, 0.18, 0]}
         assert find_posture(morphology, points, np.zeros(3), 0.0)[0] < 0.01
 

@@ -22,6 +22,7 @@ from lerobot.scripts import lerobot_record as record_module
 from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.keyboard_input import apply_recording_control
+from lerobot_rows import get_row
 from test_dataset import STREAMING, tick
 from toy_robot import SMALL, XopToyConfig, make_teleop, make_toy
 
@@ -55,25 +56,43 @@ class ForeignRobotConfig(RobotConfig):
     pass
 
 
-class ForeignRobot(Robot):
+class ForeignDevice:
+    """What LeRobot asks of robots and teleoperators alike."""
+
+    connected, count = False, 0.0
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        return {"joint.pos": float}
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    @property
+    def is_connected(self) -> bool:
+        return self.connected
+
+    def connect(self, calibrate: bool = True) -> None:
+        self.connected, self.count = True, 0.0
+
+    def disconnect(self) -> None:
+        self.connected = False
+
+    def calibrate(self) -> None:
+        pass
+
+    def configure(self) -> None:
+        pass
+
+
+class ForeignRobot(ForeignDevice, Robot):
     config_class, name = ForeignRobotConfig, "foreign"
     cameras: dict = {}
-    observation_features = {"joint.pos": float}
-    action_features = {"joint.pos": float}
-    is_calibrated = True
-    is_connected = False
 
-    def connect(self, calibrate=True):
-        self.is_connected, self.count = True, 0.0
-
-    def disconnect(self):
-        self.is_connected = False
-
-    def calibrate(self):
-        pass
-
-    def configure(self):
-        pass
+    @property
+    def observation_features(self) -> dict[str, type]:
+        return {"joint.pos": float}
 
     def get_observation(self):
         self.count += 1
@@ -89,24 +108,12 @@ class ForeignTeleopConfig(TeleoperatorConfig):
     pass
 
 
-class ForeignTeleop(Teleoperator):
+class ForeignTeleop(ForeignDevice, Teleoperator):
     config_class, name = ForeignTeleopConfig, "foreign"
-    action_features = {"joint.pos": float}
-    feedback_features = {}
-    is_calibrated = True
-    is_connected = False
 
-    def connect(self, calibrate=True):
-        self.is_connected = True
-
-    def disconnect(self):
-        self.is_connected = False
-
-    def calibrate(self):
-        pass
-
-    def configure(self):
-        pass
+    @property
+    def feedback_features(self) -> dict[str, type]:
+        return {}
 
     def get_action(self):
         return {"joint.pos": 0.5}
@@ -129,10 +136,16 @@ def record(robot, teleop, root: Path, **dataset):
     return record_module.record(config)
 
 
-def test_an_xop_teleoperator_brings_its_dataset(session):
-    teleop = make_teleop(session)
+def get_dataset_class() -> type[XopDataset]:
+    """What LeRobot's `record` makes datasets of."""
     ours = record_module.LeRobotDataset
     assert issubclass(ours, XopDataset)
+    return ours
+
+
+def test_an_xop_teleoperator_brings_its_dataset(session):
+    teleop = make_teleop(session)
+    ours = get_dataset_class()
     assert ours.session_name == session
     assert rollout_module.LeRobotDataset is ours
     assert record_module.record_loop is not STOCK_LOOP
@@ -143,7 +156,7 @@ def test_an_xop_teleoperator_brings_its_dataset(session):
 def test_two_teleoperators_leave_nothing_behind(session):
     first, second = make_teleop(f"{session}-1"), make_teleop(f"{session}-2")
     first.disconnect()
-    assert record_module.LeRobotDataset.session_name == f"{session}-2"
+    assert get_dataset_class().session_name == f"{session}-2"
     second.disconnect()
 
 
@@ -152,7 +165,7 @@ def test_columns_can_be_left_out(session):
     teleop.host.remove()
     bare = host.Host(session, extra_columns=False)
     bare.install()
-    assert record_module.LeRobotDataset.extra_columns is False
+    assert get_dataset_class().extra_columns is False
     bare.remove()
     teleop.disconnect()
 
@@ -202,7 +215,7 @@ def test_lerobot_records_lockstep_episodes_of_exact_length(session, tmp_path, mo
     assert isinstance(dataset, XopDataset)
     loaded = LeRobotDataset("local/data", root=tmp_path / "data")
     assert (loaded.num_episodes, len(loaded)) == (2, 20)
-    assert loaded[19]["operator.engaged"].item()
+    assert get_row(loaded, 19)["operator.engaged"].item()
     assert [row["length"] for row in read_facts(tmp_path / "data")] == [10, 10]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -209,7 +211,7 @@ def test_effective_samples_range_from_one_to_all():
 def find_weights_slowly(costs: np.ndarray, wanted: float) -> np.ndarray:
     """Bisection on log λ, to the last bit."""
     excess = costs - costs.min()
-    low, high = -300.0, np.log(1e4 * excess.max())
+    low, high, weights = -300.0, np.log(1e4 * excess.max()), np.empty(0)
     for _ in range(200):
         middle = (low + high) / 2
         weights = np.exp(-excess / np.exp(middle))
@@ -332,8 +334,9 @@ def test_an_unknown_retargeter_lists_the_known_ones():
 
 @pytest.mark.parametrize("name", ["num_samples", "horizon", "control_hz", "threads"])
 def test_settings_are_not_negative(name):
+    settings: dict[str, Any] = {name: -1}
     with pytest.raises(BadValue) as caught:
-        RetargeterConfig(**{name: -1})
+        RetargeterConfig(**settings)
     assert str(caught.value) == f"{name} must not be negative, got -1"
 
 

@@ -20,6 +20,7 @@ import toy_robot  # registers the toy
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts.lerobot_record import RecordConfig
 from lerobot.utils.keyboard_input import apply_recording_control
+from lerobot_rows import get_episodes, get_row
 
 from xop_lerobot.control.client import ControlClient
 from xop_lerobot.core.command import Mode
@@ -74,7 +75,7 @@ def recorded(tmp_path_factory) -> Path:
 def test_lerobot_record(recorded):
     dataset = LeRobotDataset("local/toy", root=recorded)
     assert (dataset.num_episodes, len(dataset)) == (2, 20)
-    assert dataset[15]["operator.engaged"].item()
+    assert get_row(dataset, 15)["operator.engaged"].item()
     assert dataset.meta.robot_type == "xop_toy"
 
 
@@ -85,8 +86,10 @@ def test_xop_record_writes_the_same(recorded, tmp_path, monkeypatch):
     ours, theirs = (LeRobotDataset("local/toy", root=path) for path in (root, recorded))
     assert list(ours.features) == list(theirs.features)
     for key in ("action", "observation.state", "goal.head", "retargeter.command", "time.sim"):
-        values = [np.stack(each.hf_dataset.with_format("numpy")[key]) for each in (ours, theirs)]
-        assert np.array_equal(*values), key
+        first, second = (
+            np.stack(each.hf_dataset.with_format("numpy")[key]) for each in (ours, theirs)
+        )
+        assert np.array_equal(first, second), key
 
 
 @pytest.mark.slow
@@ -107,6 +110,7 @@ def test_a_key_pressed_twice(tmp_path, monkeypatch, command):
 
     def save_and_press(self: XopDataset, *args, **kwargs) -> None:
         events = self._events
+        assert isinstance(events, dict)
         save(self, *args, **kwargs)
         apply_recording_control("right", events)
 
@@ -182,7 +186,9 @@ def test_lerobot_train_takes_state_and_pictures(policy):
     from lerobot.configs import PreTrainedConfig
 
     config = PreTrainedConfig.from_pretrained(policy)
+    assert config.input_features is not None
     assert set(config.input_features) == {"observation.state", "observation.images.head"}
+    assert config.output_features is not None
     assert set(config.output_features) == {"action"}
 
 
@@ -338,7 +344,7 @@ def test_settings_change_while_it_records(tmp_path, monkeypatch, command):
     assert modes == ["mobile", "stationary"]
     assert 0 < changes[0]["frame"] <= changes[1]["frame"] < facts["length"]
     dataset = LeRobotDataset("local/toy", root=root)
-    stored = json.loads(dataset.meta.episodes[0]["xop/changes"])
+    stored = json.loads(get_episodes(dataset)[0]["xop/changes"])
     assert stored == facts["changes"]
     times = np.ravel(dataset.hf_dataset["time.sim"])
     assert times[changes[0]["frame"]] == changes[0]["time"]

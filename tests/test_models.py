@@ -14,17 +14,17 @@ import pytest
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.core.transforms import quat_to_rpy, quat_yaw
-from xop_lerobot.morphology.morphology import MORPHOLOGIES, Morphology, make_morphology
+from xop_lerobot.morphology.morphology import MORPHOLOGIES, ModelKind, Morphology, make_morphology
 from xop_lerobot.morphology.scene import SCENES, build_model
 
 ROBOTS = ("g1", "rby1")
-KINDS = ("full", "planning")
+KINDS: tuple[ModelKind, ...] = ("full", "planning")
 CAMERAS = ("head", "left_wrist", "right_wrist", "scene")
 SITES = ("head", "left_wrist", "right_wrist", "left_palm", "right_palm")
 
 
 @cache
-def model_of(robot: str, kind: str, scene: str = "empty") -> mujoco.MjModel:
+def model_of(robot: str, kind: ModelKind, scene: str = "empty") -> mujoco.MjModel:
     return build_model(make_morphology(robot), kind, scene)
 
 

@@ -107,8 +107,8 @@ class TestG1:
             for i, name in enumerate(names):
                 assert np.linalg.norm(ours.xanchor[i] - theirs.xanchor[i]) < 1e-5, name
                 body = g1.joint(i).bodyid[0]
-                frames = [d.body(g1.body(body).name).xmat.reshape(3, 3) for d in (ours, theirs)]
-                check_rotation(*frames, name)
+                one, two = (d.body(g1.body(body).name).xmat.reshape(3, 3) for d in (ours, theirs))
+                check_rotation(one, two, name)
                 check_rotation(ours.xaxis[i], theirs.xaxis[i], name)
 
     def test_limits(self, g1: mujoco.MjModel, reference: mujoco.MjModel) -> None:
@@ -141,12 +141,24 @@ class TestG1:
                 assert g1.geom(f"{side}_foot_{i}").size[0] == 0.005
 
 
+def get_child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
+    child = element.find(tag)
+    assert child is not None, tag
+    return child
+
+
+def get_text(element: ElementTree.Element, key: str) -> str:
+    text = element.get(key)
+    assert text is not None, key
+    return text
+
+
 class Urdf:
     """A URDF read by hand, so that its numbers pass through none of our code but rotations."""
 
     def __init__(self, path: Path) -> None:
         root = ElementTree.parse(path).getroot()
-        self.links = {link.get("name"): link for link in root.findall("link")}
+        self.links = {get_text(link, "name"): link for link in root.findall("link")}
         self.joints = root.findall("joint")
 
     @staticmethod
@@ -154,12 +166,13 @@ class Urdf:
         return np.array([float(x) for x in element.get(key, "0 0 0").split()])
 
     def numbers(self, name: str) -> LinkNumbers:
-        inertial = self.links[name].find("inertial")
+        inertial = get_child(self.links[name], "inertial")
+        origin, tensor = get_child(inertial, "origin"), get_child(inertial, "inertia")
         keys = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
-        inertia = np.array([float(inertial.find("inertia").get(key)) for key in keys])
-        assert not self.vector(inertial.find("origin"), "rpy").any()
-        com = self.vector(inertial.find("origin"), "xyz")
-        return LinkNumbers(float(inertial.find("mass").get("value")), com, inertia.reshape(3, 3))
+        inertia = np.array([float(get_text(tensor, key)) for key in keys])
+        assert not self.vector(origin, "rpy").any()
+        com, mass = self.vector(origin, "xyz"), get_text(get_child(inertial, "mass"), "value")
+        return LinkNumbers(float(mass), com, inertia.reshape(3, 3))
 
     def frames(
         self, base: tuple[np.ndarray, np.ndarray], angles: Mapping[str, float]
@@ -171,7 +184,7 @@ class Urdf:
         while len(poses) < len(self.links):
             for joint in self.joints:
                 poses, axes = self._place(joint, poses, axes, angles)
-        return {name: (*poses[name], axes[name]) for name in axes}
+        return {name: (poses[name][0], poses[name][1], axis) for name, axis in axes.items()}
 
     def _place(self, joint, poses: dict, axes: dict, angles: Mapping[str, float]) -> tuple:
         parent, child = joint.find("parent").get("link"), joint.find("child").get("link")
@@ -226,17 +239,17 @@ class TestRby1:
         moving = [joint for joint in urdf.joints if joint.get("type") != "fixed"]
         assert len(moving) == rby1.njnt - 1
         for joint in moving:
-            name, limit = joint.get("name"), joint.find("limit")
+            name, limit = get_text(joint, "name"), get_child(joint, "limit")
             ours = rby1.joint(name)
             if joint.get("type") == "continuous":
                 assert not rby1.jnt_limited[ours.id]
                 speed = rby1.actuator(name).ctrlrange[1]
-                assert speed == pytest.approx(float(limit.get("velocity")))
+                assert speed == pytest.approx(float(get_text(limit, "velocity")))
                 continue
-            theirs = [float(limit.get(key)) for key in ("lower", "upper")]
+            theirs = [float(get_text(limit, key)) for key in ("lower", "upper")]
             assert np.allclose(ours.range, theirs, atol=1e-6), name
             if name in efforts:
-                assert efforts[name] == float(limit.get("effort")), name
+                assert efforts[name] == float(get_text(limit, "effort")), name
                 if name.startswith(("torso", "left_arm", "right_arm")):
                     assert efforts[name] < PLACEHOLDER
 
@@ -247,12 +260,13 @@ class TestRby1:
         assert total == pytest.approx(132.2, abs=0.05)
 
     def test_drive_matches_the_description(self, rby1: mujoco.MjModel) -> None:
-        mobile = ElementTree.parse(RBY1_URDF).getroot().find("mobile")
-        track, radius = (float(x) for x in mobile.get("params").split())
+        mobile = get_child(ElementTree.parse(RBY1_URDF).getroot(), "mobile")
+        track, radius = (float(x) for x in get_text(mobile, "params").split())
         data = mujoco.MjData(rby1)
         mujoco.mj_kinematics(rby1, data)
         wheels = [data.site(f"{side}_wheel_center").xpos for side in ("left", "right")]
         assert wheels[0][1] - wheels[1][1] == pytest.approx(track)
         assert rby1.geom("left_wheel").size[0] == pytest.approx(radius)
         assert wheels[0][2] == pytest.approx(radius)
-        assert np.mean(wheels, axis=0)[0] == pytest.approx(float(mobile.get("xyz").split()[0]))
+        middle = float(get_text(mobile, "xyz").split()[0])
+        assert np.mean(wheels, axis=0)[0] == pytest.approx(middle)

@@ -20,6 +20,7 @@ from xop_lerobot.retarget import factory
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs import CollisionCost
 from xop_lerobot.retarget.factory import make_retargeter
+from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacle_file import BadObstacles, load_obstacles
 from xop_lerobot.retarget.obstacles import SHAPES, Obstacle, ObstacleSet, make_obstacles
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
@@ -362,6 +363,7 @@ def test_a_file_adds_to_the_scene(tmp_path):
     scene = make_obstacles(build_model(morphology, "full", scene="room"))
     config = RetargeterConfig(threads=1, obstacles=write(tmp_path, FILE))
     retargeter = make_retargeter(config, morphology, make_policy("diff_drive"), model, scene)
+    assert isinstance(retargeter, MpcRetargeter)
     (collision,) = (cost for cost in retargeter.costs if isinstance(cost, CollisionCost))
     names = [obstacle.name for obstacle in collision.obstacles.obstacles]
     assert names == [

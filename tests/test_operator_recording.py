@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def save(path: Path, **changes: object) -> Path:
     return path
 
 
-def altered(key: str, index: object, value: float) -> np.ndarray:
+def altered(key: str, index: int | tuple[int | slice, ...], value: float) -> np.ndarray:
     array = make_arrays()[key].copy()
     array[index] = value
     return array
@@ -294,8 +295,9 @@ def test_replay_needs_a_path() -> None:
     ],
 )
 def test_device_settings_are_checked(field: str, value: object, message: str) -> None:
+    settings: dict[str, Any] = {field: value}
     with pytest.raises((BadValue, UnknownName)) as error:
-        DeviceConfig(**{field: value})
+        DeviceConfig(**settings)
     assert str(error.value) == message
 
 

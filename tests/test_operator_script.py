@@ -35,7 +35,7 @@ def play(name: str, seed: int = 0, noise: float = 1.0) -> dict[str, np.ndarray]:
     device.connect()
     device.start(0.0)
     length = load_script(name).duration + 2
-    frames = [device.read(time) for time in np.arange(0, length, DT)]
+    frames = [device.read(time) for time in np.arange(0, length, DT).tolist()]
     return {n: np.array([frame.pose(n) for frame in frames if frame is not None]) for n in FRAMES}
 
 
@@ -118,10 +118,10 @@ def test_stream_does_not_depend_on_what_was_read_before() -> None:
 
 def test_noise_has_the_published_size_and_band() -> None:
     noise = HumanNoise(seed=0)
-    sway = np.array([noise.at(time).head for time in np.arange(0, 300, 0.1)])
+    sway = np.array([noise.at(time).head for time in np.arange(0, 300, 0.1).tolist()])
     np.testing.assert_allclose(sway.std(axis=0), HEAD_SWAY, rtol=0.15)
     tremor = BandNoise(np.random.default_rng(0), TREMOR_BAND, TREMOR)
-    signal = np.array([tremor.at(time)[0] for time in np.arange(0, 60, 0.01)])
+    signal = np.array([tremor.at(time)[0] for time in np.arange(0, 60, 0.01).tolist()])
     assert signal.std() == pytest.approx(TREMOR[0], rel=0.15)
     power = np.abs(np.fft.rfft(signal)) ** 2
     frequency = np.fft.rfftfreq(len(signal), 0.01)

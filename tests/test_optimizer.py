@@ -314,6 +314,7 @@ def test_importance_costs_what_the_formula_says():
         sum(0.3 * nominal[t, 0] * (sample[t, 0] - nominal[t, 0]) / 0.2**2 for t in range(6))
         for sample in samples.commands
     ]  # the second entry has no noise, and no density
+    assert samples.penalty is not None
     np.testing.assert_allclose(samples.penalty, expected, rtol=1e-10)
 
 

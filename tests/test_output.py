@@ -85,10 +85,12 @@ def test_what_it_can_show_stays(monkeypatch):
 
 
 def test_streams_that_somebody_has_put_in_place_are_left_alone(monkeypatch):
-    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stdout", stream)
     make_output_readable()
     print(WORDS)
-    assert sys.stdout.getvalue() == f"{WORDS}\n"
+    assert sys.stdout is stream
+    assert stream.getvalue() == f"{WORDS}\n"
 
 
 def test_inspect(root, monkeypatch):

@@ -16,9 +16,17 @@ import pytest
 from lerobot.robots.config import RobotConfig
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators.utils import make_teleoperator_from_config
-from toy_robot import ARM_JOINTS, SMALL, XopToy, XopToyConfig, make_teleop, make_toy
+from toy_robot import ARM_JOINTS, SMALL, XopToy, XopToyConfig, make_teleop, make_toy, observe
 
-from lerobot_robot_xop import LowLevelConfig, SceneConfig, XopG1, XopG1Config, XopRby1Config
+from lerobot_robot_xop import (
+    LowLevelConfig,
+    SceneConfig,
+    XopG1,
+    XopG1Config,
+    XopRby1Config,
+    XopRobot,
+    XopRobotConfig,
+)
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadRecording, BadValue, LinkError, NotConnected, UnknownName
 from xop_lerobot.link import get_session
@@ -109,9 +117,11 @@ class Flags:
     robot: RobotConfig
 
 
-def parse_robot(*flags: str) -> RobotConfig:
+def parse_robot(*flags: str) -> XopRobotConfig:
     """What LeRobot's parser makes of command line flags."""
-    return draccus.parse(Flags, args=[f"--robot.{flag}" for flag in flags]).robot
+    robot = draccus.parse(Flags, args=[f"--robot.{flag}" for flag in flags]).robot
+    assert isinstance(robot, XopRobotConfig)
+    return robot
 
 
 @pytest.mark.parametrize("value", ["[head,scene]", "head,scene", "[head, scene]"])
@@ -194,6 +204,7 @@ def test_lerobot_makes_the_toy(session):
 @pytest.mark.parametrize("config", [XopG1Config, XopRby1Config])
 def test_features_are_known_before_connect(session, config):
     robot = make_robot_from_config(config(session=session, cameras=["head", "scene"]))
+    assert isinstance(robot, XopRobot)
     keys = [key for key, kind in robot.observation_features.items() if kind is float]
     assert all(key.endswith((".pos", ".vel")) for key in (*keys, *robot.action_features))
     assert keys[-9:-6] == ["base.height.pos", "base.roll.pos", "base.pitch.pos"]
@@ -231,7 +242,7 @@ def test_observation_matches_its_features(robot):
 
 
 def test_base_velocity_is_in_the_body(robot):
-    state = robot.get_observation() and get_session(robot.config.session).state
+    state = observe(robot)
     qpos, qvel = state.qpos.copy(), state.qvel.copy()
     # Heading +Y and moving along the world's +X: to the robot's right.
     qpos[3:7], qvel[:6] = (np.sqrt(0.5), 0, 0, np.sqrt(0.5)), (0.3, 0, 0, 0.1, 0.2, 0.4)
@@ -248,12 +259,9 @@ def test_observing_lets_no_time_pass(robot):
 
 
 def test_an_action_lasts_one_period(robot):
-    session = get_session(robot.config.session)
-    robot.get_observation()
-    before = session.state.time
+    before = observe(robot).time
     robot.send_action({})
-    robot.get_observation()
-    assert session.state.time - before == pytest.approx(1 / 25, abs=1e-9)
+    assert observe(robot).time - before == pytest.approx(1 / 25, abs=1e-9)
 
 
 def test_sent_action_is_what_is_executed(robot):
@@ -276,7 +284,7 @@ def test_who_moves_joints_alone_does_not_walk_on():
     """As LeRobot does when a policy has ended in mid-walk and the robot goes to its start."""
     robot = XopG1(XopG1Config(session="joints alone", cameras=[]))
     robot.connect()
-    keys = ("x.vel", "y.vel", "theta.vel")
+    keys, sent = ("x.vel", "y.vel", "theta.vel"), {}
     try:
         for _ in range(8):
             sent = robot.send_action(
@@ -346,13 +354,16 @@ def test_a_third_robot_is_driven(session, retargeter):
     assert list(teleop.action_features) == list(robot.action_features)
     teleop.connect()
     robot.connect()
+    action = {}
     for _ in range(60):
         robot.get_observation()
         action = teleop.get_action()
         assert list(action) == list(robot.action_features)
         assert robot.send_action(action) == action
     tick = get_session(session).tick
+    assert tick is not None
     assert tick.engaged
+    assert tick.goal is not None
     assert tick.goal.mode in Mode
     assert tick.command.shape == (2,)
     moved = [action[f"{joint}.pos"] for joint in ARM_JOINTS]

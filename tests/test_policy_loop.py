@@ -83,13 +83,20 @@ class Echo(LowLevelPolicy):
         return np.zeros((n, 1))
 
     def act(self, qpos, qvel, command, arms, memory, mode) -> PolicyOutput:
-        return PolicyOutput(np.concatenate([command, arms, [[mode]]], axis=1), memory + 1)
+        return PolicyOutput(
+            np.concatenate([command, arms, np.full((1, 1), mode)], axis=1), memory + 1
+        )
 
 
 def make_loop() -> PolicyLoop:
     loop = PolicyLoop(RBY1, Diary(), Echo())
     loop.reset(settle_s=0.0)
     return loop
+
+
+def get_diary(loop: PolicyLoop) -> Diary:
+    assert isinstance(loop.plant, Diary)
+    return loop.plant
 
 
 def ask(mode: Mode = Mode.MOBILE, **entries: float) -> RobotAction:
@@ -107,13 +114,13 @@ def ask(mode: Mode = Mode.MOBILE, **entries: float) -> RobotAction:
 def test_time_passes_in_periods_of_the_policy_inside_execute_alone(dt, calls):
     loop = make_loop()
     loop.execute(REST, dt)
-    assert len(loop.plant.applied) == calls
+    assert len(get_diary(loop).applied) == calls
     assert loop.state.time == pytest.approx(dt, abs=1e-12)
     assert loop.state.memory[0] == calls
-    measured = loop.plant.measured
+    measured = get_diary(loop).measured
     for _ in range(3):
         assert loop.state.time == pytest.approx(dt, abs=1e-12)
-    assert loop.plant.measured == measured  # reading costs no measurement
+    assert get_diary(loop).measured == measured  # reading costs no measurement
 
 
 @pytest.mark.parametrize("dt", [0.03, 0.01, 1 / 30, 1 / 60])
@@ -122,15 +129,15 @@ def test_a_period_that_does_not_fit_is_refused(dt):
     with pytest.raises(BadValue) as caught:
         loop.execute(REST, dt)
     assert str(caught.value) == f"dt = {dt} s is not a whole multiple of the policy period 0.02 s"
-    assert not loop.plant.applied
+    assert not get_diary(loop).applied
 
 
 def test_reset_settles_the_robot_and_forgets():
     loop = make_loop()
     loop.execute(ask(v=0.5), 0.04)
     loop.reset(seed=7, settle_s=0.2)
-    assert loop.plant.seeds[-1] == 7
-    assert len(loop.plant.applied) == 10
+    assert get_diary(loop).seeds[-1] == 7
+    assert len(get_diary(loop).applied) == 10
     assert loop.state.memory[0] == 10
     # Rounded as every action is: what is predicted from it is what happens.
     np.testing.assert_array_equal(loop.state.command, REST.command.astype(np.float32))
@@ -141,7 +148,7 @@ def test_reset_settles_the_robot_and_forgets():
 def test_closing_closes_the_plant():
     loop = make_loop()
     loop.close()
-    assert loop.plant.closed == 1
+    assert get_diary(loop).closed == 1
 
 
 # -- what is executed ----------------------------------------------------------------------
@@ -152,7 +159,7 @@ def test_what_is_returned_is_what_the_policy_was_given():
     wild = ask(v=3.0, torso_1=-5.0)
     for _ in range(5):
         executed = loop.execute(wild, 0.04)
-        given = loop.plant.applied[-1]
+        given = get_diary(loop).applied[-1]
         np.testing.assert_array_equal(given[: len(SPACE)], executed.command)
         np.testing.assert_array_equal(given[len(SPACE) : -1], executed.arms)
         assert given[-1] == Mode.MOBILE
@@ -220,7 +227,7 @@ def test_a_command_of_the_wrong_shape_moves_nothing():
     with pytest.raises(BadShape) as caught:
         loop.execute(RobotAction(np.zeros(3), Mode.MOBILE, REST.arms), 0.02)
     assert str(caught.value) == "command must have shape (8,), got (3,)"
-    assert not loop.plant.applied
+    assert not get_diary(loop).applied
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -232,7 +239,7 @@ def test_a_number_that_is_not_finite_moves_nothing(part, value):
     with pytest.raises(BadValue) as caught:
         loop.execute(action, 0.02)
     assert str(caught.value) == f"{part} must be finite, got {getattr(action, part)}"
-    assert not loop.plant.applied
+    assert not get_diary(loop).applied
 
 
 def test_arms_of_the_wrong_shape_move_nothing():
@@ -257,7 +264,7 @@ def test_a_state_never_changes_under_its_reader():
 
 def test_a_touch_within_the_tick_is_not_missed():
     loop = make_loop()
-    loop.plant.collides_at = {2}
+    get_diary(loop).collides_at = {2}
     assert not loop.state.collision
     loop.execute(REST, 0.1)
     assert loop.state.collision
@@ -326,8 +333,7 @@ def test_execute_limits_as_lock_step_does(realtime):
 def test_the_watchdog_stops_the_robot_and_keeps_its_posture(realtime):
     realtime.reset(settle_s=0.0)
     lean = REST.command[SPACE.index("torso_1")] + 0.05
-    for _ in range(60):
-        executed = realtime.execute(ask(v=0.6, torso_1=lean), 0.04)
+    executed = [realtime.execute(ask(v=0.6, torso_1=lean), 0.04) for _ in range(60)][-1]
     assert executed.command[0] == pytest.approx(0.6)
     wait_for(lambda: realtime.state.command[0] == 0)
     state = realtime.state
@@ -486,7 +492,7 @@ def test_the_real_policy_takes_what_the_loop_gives():
     loop.reset(settle_s=0.0)
     for _ in range(30):
         loop.execute(ask(v=1.0), 0.04)
-    targets = loop.plant.applied[-1]
+    targets = get_diary(loop).applied[-1]
     assert (targets == -10.0).sum() == 2  # 1 m/s on wheels of 0.1 m
 
 
@@ -534,7 +540,12 @@ def test_targets_come_in_a_straight_line_where_the_controller_ramps(robot, ramps
     arms[column] += 0.08
     sent = []
     step = plant._step_once
-    plant._step_once = lambda: (sent.append(plant.data.ctrl[index]), step())
+
+    def note_and_step() -> None:
+        sent.append(plant.data.ctrl[index])
+        step()
+
+    plant._step_once = note_and_step
     begin = plant.data.ctrl[index]
     executed = loop.execute(RobotAction(loop.action.command, Mode.STATIONARY, arms), 0.04)
     assert executed.arms[column] == pytest.approx(arms[column], abs=1e-6)

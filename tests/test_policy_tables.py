@@ -42,7 +42,11 @@ def open_network(file: Path) -> Callable[..., Any]:
     return call
 
 
-def make_states(steps: int, seed: int) -> list[tuple[np.ndarray, ...]]:
+State = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Position, velocity, command and arms of a robot, or of several as a batch."""
+
+
+def make_states(steps: int, seed: int) -> list[State]:
     """Random states, commands and arm targets, walking fast enough to count as walking."""
     rng = np.random.default_rng(seed)
     standing = make_morphology("g1").standing_qpos()
@@ -141,9 +145,10 @@ def load_made_up(name: str, folder: Path) -> NetworkPolicy:
     return load_policy(name, None if name == "default" else str(folder))
 
 
-def stack(states: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
+def stack(states: list[State]) -> State:
     """States of several robots as a batch."""
-    return tuple(np.stack(each) for each in zip(*states, strict=True))
+    qpos, qvel, command, arms = (np.stack(each) for each in zip(*states, strict=True))
+    return qpos, qvel, command, arms
 
 
 def test_every_table_that_ships_is_tested() -> None:
@@ -158,7 +163,8 @@ def test_batches_modes_and_purity(name: str, made_up: Path) -> None:
     modes = np.array([STAND, WALK, STAND, WALK])
     together, alone = policy.initial_memory(n), [policy.initial_memory() for _ in range(n)]
     for step in range(6):
-        batch = stack(make_states(n, seed=step))
+        states = make_states(n, seed=step)
+        batch = stack(states)
         kept = [each.copy() for each in (*batch, together)]
         targets, after = policy.act(*batch, together, modes)
         for before, now in zip(kept, (*batch, together), strict=True):
@@ -166,9 +172,7 @@ def test_batches_modes_and_purity(name: str, made_up: Path) -> None:
         assert not np.shares_memory(after, together)
         together = after
         for row in range(n):
-            own, alone[row] = policy.act(
-                *(each[row : row + 1] for each in batch), alone[row], Mode(modes[row])
-            )
+            own, alone[row] = policy.act(*stack([states[row]]), alone[row], Mode(modes[row]))
             np.testing.assert_allclose(own[0], targets[row], atol=1e-5)
             np.testing.assert_allclose(alone[row][0], together[row], atol=1e-4)
         if step == 3:
@@ -394,7 +398,7 @@ def test_a_file_that_describes_itself_needs_no_table(tmp_path: Path) -> None:
              command[4:7] * [2, 2, 0.25]]
         )  # fmt: skip
         actions = network(seen[None].astype(np.float32))[0].astype(float)
-        targets, memory = policy.act(*(each[None] for each in state), memory, WALK)
+        targets, memory = policy.act(*stack([state]), memory, WALK)
         wanted = np.concatenate([0.1 + 0.4 * actions[:15], arms])
         np.testing.assert_allclose(targets[0], np.clip(wanted, low, high), atol=1e-5)
 
@@ -413,7 +417,7 @@ def test_holosomas_file_brings_its_gains(tmp_path: Path) -> None:
     np.testing.assert_array_equal(policy.motors.stiffness, np.full(29, 33.0))
     reference = plain.PlainHolosoma(open_network(file), take_arms=True, clip=True)
     state = make_states(1, seed=0)[0]
-    targets, _ = policy.act(*(each[None] for each in state), policy.initial_memory(), STAND)
+    targets, _ = policy.act(*stack([state]), policy.initial_memory(), STAND)
     np.testing.assert_allclose(targets[0], reference.step(*state, STAND).targets, atol=1e-5)
 
 

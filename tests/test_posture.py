@@ -181,7 +181,7 @@ def bend_and_walk(clock: float) -> np.ndarray:
         ]
     )
     x, z, pitch, yaw = (np.interp(clock, rows[:, 0], column) for column in rows[:, 1:].T)
-    return make_pose([x, 0.0, z], quat_from_rpy(0.0, pitch, yaw))
+    return make_pose(np.array([x, 0.0, z]), quat_from_rpy(0.0, pitch, yaw))
 
 
 def test_who_bends_quickly_and_walks_on_is_met_with_folded_knees(fleet):
@@ -197,6 +197,7 @@ def test_who_bends_quickly_and_walks_on_is_met_with_folded_knees(fleet):
         qpos, command = robot.step(qpos, command, goal, dt, i * dt)
         heaviest = max(heaviest, float(robot.load.compute_excess(qpos[None]).max()))
     head, _ = robot.place(qpos)
+    pose = bend_and_walk((ticks - 1) * dt)
     assert np.linalg.norm(head[:3] - pose[:3]) < 0.05
     assert command[robot.space.index("torso_2")] < -1.0
     assert heaviest < 0.1  # of what the motors can, beyond 85 percent
@@ -235,7 +236,8 @@ def test_a_goal_that_turns_past_half_a_turn_stays_on_its_side(fleet):
     guide, robot = fleet["rby1"].mpc._postures, fleet["rby1"]
     guide.reset()
     beyond = [
-        guide._compute_turn_beyond(quat_from_yaw(turn), 0.0) for turn in np.arange(0.0, 3.9, 0.1)
+        guide._compute_turn_beyond(quat_from_yaw(turn), 0.0)
+        for turn in np.arange(0.0, 3.9, 0.1).tolist()
     ]
     assert min(beyond[:38]) >= 0  # up to 3.7 rad it is beyond the limit on the left
     assert beyond[-1] <= 0

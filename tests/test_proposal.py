@@ -372,7 +372,8 @@ def test_the_residuals_derivative_equals_finite_differences(parts, name, mode):
     qpos = p.qpos.copy()
     qpos[3:7] = quat_exp(np.array([0.1, -0.2, 0.7]))
     command = decision.space.neutral + 0.1 * rng.normal(size=len(decision.space))
-    goals = {frame: np.array([0.5, 0.2, 1.1, *quat_exp([0.2, 0.3, 0.5])]) for frame in frames}
+    turn = quat_exp(np.array([0.2, 0.3, 0.5]))
+    goals = {frame: np.array([0.5, 0.2, 1.1, *turn]) for frame in frames}
 
     def linearise(command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         wanted = np.array([0.4, 0.3])

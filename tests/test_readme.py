@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import draccus
 import numpy as np
@@ -66,7 +67,7 @@ def find_config_class(name: str) -> type:
     return Config
 
 
-def parse(command: list[str], monkeypatch: pytest.MonkeyPatch) -> object:
+def parse(command: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     """Parse the flags as the command would; a policy that was never trained is any ACT."""
     name, *flags = command
     paths = [flag.split("=")[1] for flag in flags if flag.startswith("--config_path=")]

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset, dataset_metadata, dataset_writer, image_writer
 from lerobot.datasets.video_utils import StreamingVideoEncoder
+from lerobot_rows import get_row
 from test_dataset import REPO, STREAMING, create, pair, session, tick  # noqa: F401  fixtures
 from toy_robot import make_toy
 
@@ -35,8 +36,9 @@ def read_files(root: Path) -> dict[str, bytes]:
 
 
 def record(pair, dataset, frames: int = 3) -> None:  # noqa: F811
+    robot, teleop = pair
     for _ in range(frames):
-        tick(*pair, dataset)
+        tick(robot, teleop, dataset)
 
 
 def cut(path: str):
@@ -102,7 +104,7 @@ def test_a_full_disk_costs_one_episode(
     dataset.finalize()
     loaded = LeRobotDataset("local/toy", root=root)
     assert (loaded.num_episodes, len(loaded)) == (3, 9)
-    assert loaded[8]["observation.images.head"].shape == (3, 48, 64)
+    assert get_row(loaded, 8)["observation.images.head"].shape == (3, 48, 64)
     assert [row["episode_index"] for row in read_facts(root)] == [0, 1, 2]
 
 
@@ -149,12 +151,13 @@ def test_what_cannot_be_taken_back_is_repaired(
 def test_a_disk_that_fills_up_during_an_episode(
     session, pair, tmp_path, monkeypatch  # noqa: F811
 ):  # fmt: skip
-    dataset = create(session, pair[0], tmp_path / "data", **STREAMING)
+    robot, teleop = pair
+    dataset = create(session, robot, tmp_path / "data", **STREAMING)
     record(pair, dataset)
     dataset.save_episode()
     monkeypatch.setattr(StreamingVideoEncoder, "feed_frame", lambda self, *_: fail_thread(self))
     with pytest.raises(NotSaved, match=f"episode 1 could not be saved .* {FULL}"):
-        tick(*pair, dataset)
+        tick(robot, teleop, dataset)
     dataset.finalize()
     assert LeRobotDataset("local/toy", root=tmp_path / "data").num_episodes == 1
 
@@ -243,4 +246,4 @@ def test_a_disk_that_is_really_full(tmp_path):
     loaded = LeRobotDataset("local/toy", root=copy)
     assert loaded.num_episodes == len(read_facts(copy)) > 0
     assert np.all(np.bincount(loaded.hf_dataset["episode_index"]) == 10)
-    assert loaded[len(loaded) - 1]["observation.images.head"].shape == (3, 48, 64)
+    assert get_row(loaded, len(loaded) - 1)["observation.images.head"].shape == (3, 48, 64)

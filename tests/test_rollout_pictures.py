@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from threading import Event
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from lerobot.configs import FeatureType, PolicyFeature
@@ -15,6 +17,7 @@ from toy_robot import XopToyConfig
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.dataset.rollout_pictures import watch_rollouts
 
+EVENT = Event()
 TEXT = (
     "policy was trained with pictures of 128 x 96 of camera 'head', and the robot's are 320 x 240"
 )
@@ -35,11 +38,13 @@ def make_inputs(*cameras: str) -> dict[str, PolicyFeature]:
     return {"observation.state": state, **{f"observation.images.{c}": picture for c in cameras}}
 
 
-def roll_out(robot, *cameras: str, policy=ACTConfig, rename_map=None) -> None:
+def roll_out(
+    robot, *cameras: str, policy: type[ACTConfig | SmolVLAConfig] = ACTConfig, rename_map=None
+) -> None:
     """What `lerobot-rollout` begins with."""
     config = policy(input_features=make_inputs(*cameras), device="cpu")
-    cfg = SimpleNamespace(robot=robot, policy=config, rename_map=rename_map or {})
-    lerobot_rollout.build_rollout_context(cfg, "event")
+    cfg: Any = SimpleNamespace(robot=robot, policy=config, rename_map=rename_map or {})
+    lerobot_rollout.build_rollout_context(cfg, EVENT)
 
 
 def test_another_size_is_refused(built):
@@ -71,7 +76,7 @@ def test_what_fits_is_passed_through(built):
     ):
         roll_out(robot, *cameras)
         assert built[-1][0].robot is robot
-    assert [event for _, event in built] == ["event"] * 4
+    assert [event for _, event in built] == [EVENT] * 4
 
 
 def test_a_policy_that_resizes_is_only_told_of(built, caplog):

@@ -41,10 +41,10 @@ def planner(rby1):
 
 def place(rby1, x=0.0, y=0.0, yaw=0.0):
     """Configuration, and pose of the resting head, of a base somewhere."""
-    world = make_pose([x, y, 0], quat_from_yaw(yaw))
+    world = make_pose(np.array([x, y, 0]), quat_from_yaw(yaw))
     qpos = rby1.standing_qpos()
     qpos[:7] = pose_multiply(world, qpos[:7])
-    return qpos, pose_multiply(world, make_pose([RESTING, 0, 1.4], quat_from_yaw(0)))
+    return qpos, pose_multiply(world, make_pose(np.array([RESTING, 0, 1.4]), quat_from_yaw(0)))
 
 
 def go(planner, rby1, goal, speeds=(0.0, 0.0), duration=8.0, **start):
@@ -53,7 +53,7 @@ def go(planner, rby1, goal, speeds=(0.0, 0.0), duration=8.0, **start):
 
 
 def make_goal(x, y, yaw=0.0):
-    return make_pose([x + RESTING, y, 1.4], quat_from_yaw(yaw))
+    return make_pose(np.array([x + RESTING, y, 1.4]), quat_from_yaw(yaw))
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_the_base_turns_where_arms_are_in_the_way_of_the_waist(planner, rby1, ya
 
 def test_where_the_world_lies_does_not_matter(planner, rby1):
     route = go(planner, rby1, make_goal(0.4, 1.0, 0.5))
-    world = make_pose([3, -2, 0], quat_from_yaw(2.0))
+    world = make_pose(np.array([3, -2, 0]), quat_from_yaw(2.0))
     goal = pose_multiply(world, make_goal(0.4, 1.0, 0.5))
     turned = go(planner, rby1, goal, x=3, y=-2, yaw=2.0)
     np.testing.assert_allclose(turned.headings - 2.0, route.headings, atol=1e-9)
@@ -143,8 +143,8 @@ def test_where_the_world_lies_does_not_matter(planner, rby1):
 def test_a_hand_has_the_base_arrive_as_it_faces(planner, rby1):
     """A wrist looks nowhere: after the way the base faces as before."""
     qpos, _ = place(rby1)
-    hand = make_pose([0.5, 0.3, 1.0], quat_from_yaw(1.0))
-    goal = make_pose([0.5, 1.3, 1.0], quat_from_yaw(-1.0))
+    hand = make_pose(np.array([0.5, 0.3, 1.0]), quat_from_yaw(1.0))
+    goal = make_pose(np.array([0.5, 1.3, 1.0]), quat_from_yaw(-1.0))
     route = planner.plan(qpos, (0.0, 0.0), "left_wrist", hand, goal, 12.0)
     assert not route.offsets[-25:].any()
     assert abs(route.headings[-1]) < 0.3
@@ -284,7 +284,7 @@ def test_a_wall_behind_the_goal_makes_no_detour(rby1):
 def test_the_waist_goes_round_by_its_front(rby1, planner):
     """From one limit to beyond the other the head has to turn all the way back."""
     qpos, head = place(rby1)
-    head = pose_multiply(head, make_pose([0, 0, 0], quat_from_yaw(2.1)))
+    head = pose_multiply(head, make_pose(np.array([0, 0, 0]), quat_from_yaw(2.1)))
     goal = make_pose(head[:3], quat_from_yaw(-2.0))  # 2.2 rad on in the barred direction
     route = planner.plan(qpos, (0.0, 0.0), "head", head, goal, 4.0)
     looks = -2.0 + route.turns
@@ -303,7 +303,7 @@ def test_the_waist_goes_round_by_its_front(rby1, planner):
 def test_a_goal_behind_the_back_is_waited_for(rby1, planner):
     """Beyond both limits the waist stays on its side until the base has turned."""
     qpos, head = place(rby1)
-    head = pose_multiply(head, make_pose([0, 0, 0], quat_from_yaw(2.2)))
+    head = pose_multiply(head, make_pose(np.array([0, 0, 0]), quat_from_yaw(2.2)))
     goal = make_pose(head[:3], quat_from_yaw(-3.0))
     route = planner.plan(qpos, (0.0, 0.0), "head", head, goal, 6.0)
     assert route.share == 1
@@ -314,7 +314,7 @@ def test_a_goal_behind_the_back_is_waited_for(rby1, planner):
 def test_the_base_turns_with_a_goal_that_turns(rby1, planner):
     """A waist twisted by 1 rad may stay so at rest; behind a person who turns it may not."""
     qpos, head = place(rby1)
-    head = pose_multiply(head, make_pose([0, 0, 0], quat_from_yaw(1.0)))
+    head = pose_multiply(head, make_pose(np.array([0, 0, 0]), quat_from_yaw(1.0)))
     turned = [
         planner.plan(qpos, (0.0, 0.0), "head", head, head, 2.0, turn_rate=rate).headings[-1]
         for rate in (0.0, 0.25, 0.35, 1.0)
@@ -330,7 +330,7 @@ def test_a_goal_that_looks_straight_down_has_a_heading(planner, rby1, roll):
     qpos, head = place(rby1)
     ends = []
     for pitch in np.linspace(1.2, 1.9, 8):
-        goal = make_pose([2.0 + RESTING, 0, 0.7], quat_from_rpy(roll, pitch, 0.0))
+        goal = make_pose(np.array([2.0 + RESTING, 0, 0.7]), quat_from_rpy(roll, pitch, 0.0))
         pose = make_pose(head[:3], quat_from_rpy(roll, pitch - 0.1, 0.0))
         ends.append(planner.plan(qpos, (0.0, 0.0), "head", pose, goal, 4.0, room=0.2).headings[-1])
     assert np.abs(np.diff(ends)).max() < 0.2

@@ -39,6 +39,7 @@ def test_sag_is_seen_in_time():
     targets = np.zeros(200)
     servo = ServoFilter(np.array([LAG]))
     servo.update(targets[:1], np.zeros(1), DT)
+    seen = np.zeros(1)
     for _ in range(50):  # 2 s, five time constants
         seen = servo.update(targets[:1], np.full(1, -0.01), DT)
     assert seen[0] == pytest.approx(-0.01, rel=0.01)

@@ -6,17 +6,18 @@ import threading
 
 import numpy as np
 import pytest
-from toy_robot import make_teleop, make_toy
+from toy_robot import make_teleop, make_toy, observe
 
 from lerobot_robot_xop import XopG1Config, XopRby1, XopRby1Config
 from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.core.state import Goal
-from xop_lerobot.link import get_session
+from xop_lerobot.link import Session, get_session
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.operator.view import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.retarget.background import BackgroundPlanner
@@ -27,6 +28,7 @@ from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.tasks.dual_point_touch import TOLERANCE
 from xop_lerobot.tasks.furniture import place
 from xop_lerobot.tasks.stage import Stage
+from xop_lerobot.tasks.task import TaskStatus
 
 TASK = "dual_point_touch"
 
@@ -244,9 +246,7 @@ def test_background_planner_hands_obstacles_over_between_solves():
     assert retargeter.heard == []
     toy = make_toy("stage_background")
     toy.connect()
-    toy.get_observation()
-    state = get_session("stage_background").state
-    planner.submit(state, Goal({}), 0)
+    planner.submit(observe(toy), Goal({}), 0)
     planner.run_once()
     assert retargeter.heard == [("MainThread", obstacles), "plan"]
     toy.disconnect()
@@ -266,24 +266,30 @@ def test_robot_without_a_task_publishes_no_outcome():
     robot.disconnect()
 
 
+def see(session: Session) -> View:
+    assert session.view is not None
+    return session.view
+
+
 def test_robot_publishes_view_outcome_and_obstacles():
     robot, teleop = make_toy("stage_toy", task=TASK), make_teleop("stage_toy")
     robot.connect()
     teleop.connect()
     session = get_session("stage_toy")
     robot.get_observation()
-    assert session.view.task == TASK
-    first = session.view.objects["left_point"].pose
+    assert see(session).task == TASK
+    first = see(session).objects["left_point"].pose
     robot.send_action(teleop.get_action())
+    assert isinstance(session.outcome, TaskStatus)
     assert session.outcome.done is False
     assert session.outcome.figures["left_palm_distance"] > TOLERANCE
     assert session.obstacles == ()
     session.begin_episode(1)
     robot.get_observation()
-    assert not np.allclose(session.view.objects["left_point"].pose, first)
+    assert not np.allclose(see(session).objects["left_point"].pose, first)
     session.begin_episode(0)
     robot.get_observation()
-    assert np.array_equal(session.view.objects["left_point"].pose, first)
+    assert np.array_equal(see(session).objects["left_point"].pose, first)
     teleop.disconnect()
     robot.disconnect()
 
@@ -296,7 +302,7 @@ def test_robot_config_takes_the_tasks_scene():
         XopG1Config(task="dance")
 
 
-def test_teleoperator_learns_of_obstacles():
+def test_teleoperator_learns_of_obstacles(monkeypatch):
     robot = XopRby1(XopRby1Config(session="stage_rby1", task=TASK, cameras=[]))
     teleop = Xop(XopConfig(session="stage_rby1"))
     robot.connect()
@@ -304,8 +310,9 @@ def test_teleoperator_learns_of_obstacles():
     robot.get_observation()
     teleop.get_action()
     teleoperation = teleop._teleoperation
-    told = []
-    teleoperation.retargeter.set_obstacles = told.append
+    assert teleoperation is not None
+    told: list[tuple[Obstacle, ...]] = []
+    monkeypatch.setattr(teleoperation.retargeter, "set_obstacles", told.append)
     get_session("stage_rby1").begin_episode(1)
     robot.get_observation()
     teleop.get_action()

@@ -49,6 +49,7 @@ def draw_points(
 ) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Left point, right point [m] and the heading that faces them, by seed."""
     stage = Stage(make_morphology(robot), task)
+    assert isinstance(stage.task, touch.DualPointTouch)
     drawn = []
     for seed in seeds:
         stage.reset(seed)
@@ -69,9 +70,14 @@ def test_points_are_outside_the_first_workspace(robot):
         assert (left - right) @ make_direction(facing + np.pi / 2) > 0
 
 
+def measure_room(stage: Stage) -> np.ndarray:
+    room = find_room(stage.plant.model)
+    assert room is not None
+    return room
+
+
 def test_some_points_are_near_a_wall_and_all_inside():
-    stage = Stage(make_morphology("rby1"), "dual_point_touch")
-    low, high = find_room(stage.plant.model)
+    low, high = measure_room(Stage(make_morphology("rby1"), "dual_point_touch"))
     gaps = []
     for left, right, _ in draw_points("rby1", range(100)):
         points = np.stack([left, right])[:, :2]
@@ -191,7 +197,7 @@ def test_box_rests_on_its_support_and_stays_there(robot):
 
 def test_furniture_is_in_the_room_with_space_for_the_robot():
     stage = make_box_stage("rby1")
-    low, high = find_room(stage.plant.model)
+    low, high = measure_room(stage)
     for seed in range(50):
         stage.reset(seed)
         for name in ("table", "support"):
@@ -222,6 +228,7 @@ def test_box_on_the_table_counts_only_after_it_was_picked_up():
     put_box(stage, spot)
     run(stage, 1.5)
     assert not stage.status.success
+    assert isinstance(stage.task, box_task.BoxPickAndPlace)
     stage.task._picked_up = True
     run(stage, 0.9)
     assert not stage.status.success

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Plan, Retargeter
+from xop_lerobot.retarget.plan_track import StampedPlan
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
@@ -57,12 +59,12 @@ def make_frame(
 ) -> OperatorFrame:
     """A person with the hands in front of the body."""
     turn = quat_from_yaw(yaw)
-    wrists = [
+    left, right = (
         make_pose(head + quat_rotate(turn, np.array([0.35, y, -0.5])), turn) for y in (0.2, -0.2)
-    ]
+    )
     seen = np.array([tracked, True, True])
-    values = {"pinch": OPEN, "tracked": seen} | fields
-    return OperatorFrame(t, make_pose(head, turn), *wrists, **values)
+    values: dict[str, Any] = {"pinch": OPEN, "tracked": seen, **fields}
+    return OperatorFrame(t, make_pose(head, turn), left, right, **values)
 
 
 def stand(t: float) -> OperatorFrame:
@@ -88,14 +90,19 @@ class Rig:
         plant = Simulation(morphology, SimulationConfig(), kind="planning")
         self.loop = PolicyLoop(morphology, plant, make_policy(POLICIES[name]))
         self.info = RobotInfo(f"xop_{name}", morphology, POLICIES[name], None, "empty", fps, 0)
-        config = TeleoperationConfig(
-            device=DeviceConfig(**({"type": "person"} | device)), retargeter=retargeter
-        )
+        settings: dict[str, Any] = {"type": "person", **device}
+        config = TeleoperationConfig(device=DeviceConfig(**settings), retargeter=retargeter)
         self.teleop = Teleoperation(config, self.info)
         self.teleop.connect()
-        self.person = self.teleop.device
         self.kinematics = SiteKinematics(plant.model, tuple(morphology.frames.values()))
         self.loop.reset(seed=0, settle_s=0.8)
+
+    @property
+    def person(self) -> Person:
+        """The device, where the test is the person."""
+        device = self.teleop.device
+        assert isinstance(device, Person)
+        return device
 
     @property
     def frames(self) -> dict[str, np.ndarray]:
@@ -567,6 +574,13 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
+def wait_for_plan(planner: BackgroundPlanner) -> StampedPlan:
+    wait_for(lambda: planner.latest is not None)
+    latest = planner.latest
+    assert latest is not None
+    return latest
+
+
 @pytest.fixture
 def background() -> Iterator[tuple[BackgroundPlanner, SlowRetargeter]]:
     retargeter = SlowRetargeter()
@@ -585,9 +599,9 @@ def test_the_planner_never_makes_its_caller_wait(background):
     wait_for(lambda: retargeter.asked == [1.0])
     assert planner.latest is None  # it is at it
     retargeter.go.release()
-    wait_for(lambda: planner.latest is not None)
-    assert planner.latest.time == 1.0
-    assert planner.latest.plan.command[0] == 1.0
+    latest = wait_for_plan(planner)
+    assert latest.time == 1.0
+    assert latest.plan.command[0] == 1.0
 
 
 def test_a_slow_planner_goes_on_from_the_newest_state(background):
@@ -612,8 +626,7 @@ def test_a_plan_from_before_a_reset_is_thrown_away(background):
     assert planner.latest is None
     assert retargeter.resets == [5.0]
     retargeter.go.release()
-    wait_for(lambda: planner.latest is not None)
-    assert planner.latest.time == 5.0
+    assert wait_for_plan(planner).time == 5.0
 
 
 def test_a_failure_of_the_planner_reaches_the_caller(background):
@@ -631,8 +644,7 @@ def test_a_failure_of_the_planner_reaches_the_caller(background):
     assert planner.latest is None
     planner.submit(make_state(3.0), Goal({}))
     retargeter.go.release()
-    wait_for(lambda: planner.latest is not None)
-    assert planner.latest.time == 3.0
+    assert wait_for_plan(planner).time == 3.0
     assert retargeter.resets == [3.0]
 
 
@@ -644,8 +656,11 @@ def test_in_real_time_the_robot_holds_until_the_first_plan_and_then_follows():
     real, slow = teleop.retargeter, SlowRetargeter()
     slow.plan = lambda state, goal: (slow.go.acquire(timeout=120), real.plan(state, goal))[1]
     slow.reset = real.reset
-    teleop._follower.background._retargeter = slow
-    teleop.device.motion = lambda t: make_frame(t, (0, 0, 1.7 - 0.2 * min(t, 1.0)))
+    planner, person = teleop._follower.background, teleop.device
+    assert planner is not None
+    assert isinstance(person, Person)
+    planner._retargeter = slow
+    person.motion = lambda t: make_frame(t, (0, 0, 1.7 - 0.2 * min(t, 1.0)))
     loop = PolicyLoop(
         morphology, Simulation(morphology, SimulationConfig()), make_policy("diff_drive")
     )
@@ -659,10 +674,11 @@ def test_in_real_time_the_robot_holds_until_the_first_plan_and_then_follows():
         loop.execute(action, 0.04)
     for _ in range(1000):
         slow.go.release()
-    wait_for(lambda: teleop._follower.background.latest is not None)
-    for _ in range(25):
-        action, record = teleop.step(loop.state)
+    wait_for_plan(planner)
+    for _ in range(24):
+        action, _ = teleop.step(loop.state)
         loop.execute(action, 0.04)
+    action, record = teleop.step(loop.state)
     assert record.health["plan_age"] >= 0
     assert np.abs(action.command - rest.command).max() > 0.01
     teleop.disconnect()

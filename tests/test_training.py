@@ -20,9 +20,11 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
+from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from lerobot_rows import get_row
 from reached import collect_reach
 
 from lerobot_robot_xop import XopG1Config, XopRby1Config
@@ -83,7 +85,7 @@ def test_a_policy_is_made_for_state_pictures_and_action_alone(
 
 def test_the_configuration_that_is_shipped():
     config = draccus.parse(TrainPipelineConfig, config_path=CONFIG, args=[])
-    assert config.policy is not None
+    assert isinstance(config.policy, ACTConfig)
     assert (config.policy.type, config.policy.device) == ("act", "cpu")
     assert not config.policy.push_to_hub
     # Features are the dataset's: none is named by hand.
@@ -117,6 +119,8 @@ def policy(collected, tmp_path_factory) -> Path:
 @pytest.mark.slow
 def test_a_trained_policy_has_these_inputs_and_outputs(policy):
     config = PreTrainedConfig.from_pretrained(policy)
+    assert config.input_features is not None
+    assert config.output_features is not None
     shapes = {key: tuple(feature.shape) for key, feature in config.input_features.items()}
     assert shapes == {
         "observation.state": (61,),
@@ -134,7 +138,7 @@ def test_nothing_but_its_inputs_changes_what_it_does(policy, collected):
     config.device = "cpu"
     act = ACTPolicy.from_pretrained(policy, config=config)
     prepare, _ = make_pre_post_processors(policy_cfg=config, pretrained_path=str(policy))
-    row = LeRobotDataset("local/data", root=collected)[20]
+    row = get_row(LeRobotDataset("local/data", root=collected), 20)
 
     def predict(row: dict) -> torch.Tensor:
         act.reset()
@@ -185,12 +189,12 @@ def test_it_drives_the_robot_and_is_evaluated(policy, tmp_path, monkeypatch):
             "--return_to_initial_position=false",
         )
         assert [facts["length"] for facts in read_facts(tmp_path / name)] == [25, 25]
-    actions = [
+    one, two = (
         np.stack(LeRobotDataset("local/r", root=tmp_path / name).hf_dataset["action"])
         for name in ("one", "two")
-    ]
+    )
     # In lock-step the same policy does the same with the same seeds.
-    assert np.array_equal(*actions)
+    assert np.array_equal(one, two)
 
     command = [sys.executable, REPO / "scripts" / "evaluate_policy.py", "--at", "1", "--json"]
     command += [tmp_path / "out.json", "--rollouts", f"one={tmp_path / 'one'}"]

@@ -96,6 +96,7 @@ def test_nothing_touches_the_robot_at_the_start(robot):
 def test_obstacle_stands_between_palm_and_opening_and_hinders():
     """A palm that goes straight at its height would run into it."""
     stage, _ = make_stage("rby1")
+    assert isinstance(stage.task, transport.NonPrehensileTransport)
     for seed in range(15):
         stage.reset(seed)
         seen, palm = stage.task.objects, stage.task.start_palm

@@ -48,7 +48,8 @@ def test_without_the_constraint_a_tilt_is_free():
 
 @pytest.mark.parametrize("tilt", [0.0, 0.05, 0.5, np.pi])
 def test_only_the_tilt_counts(tilt):
-    pose = make_pose(np.ones(3), quat_multiply(quat_from_rpy(0, 0, 1.2), quat_exp([tilt, 0, 0])))
+    tilted = quat_exp(np.array([tilt, 0, 0]))
+    pose = make_pose(np.ones(3), quat_multiply(quat_from_rpy(0, 0, 1.2), tilted))
     assert compute_upright(pose) == pytest.approx(2 * (1 - np.cos(tilt)))
     assert compute_upright(pose) == pytest.approx(tilt**2, rel=0.1) or tilt == np.pi
 

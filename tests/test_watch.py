@@ -194,7 +194,9 @@ def test_the_operator_is_told_and_the_arms_go_back_to_rest(name, monkeypatch):
         "Disengaged: it stands, its arms go back to rest."
     )
     assert rig.teleop._board.notices[-1].cue is Cue.DISENGAGED
-    assert "The robot moves though it is told to stand." in rig.teleop._shown.warnings
+    shown = rig.teleop._shown
+    assert shown is not None
+    assert "The robot moves though it is told to stand." in shown.warnings
     first = rig.loop.state.arms
     for _ in range(5):
         action, record = rig.tick()
@@ -208,6 +210,7 @@ def test_an_episode_says_when_its_robot_was_in_trouble(tmp_path):
     robot, teleop = make_toy("watch"), make_teleop("watch")
     robot.connect()
     teleop.connect()
+    assert isinstance(robot._loop, PolicyLoop)
     watch = robot._loop._watch
     dataset = create("watch", robot, tmp_path / "d")
     for index in range(12):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import headset
@@ -303,7 +303,7 @@ def test_frames_never_queue_up(desk, open_at):
 # The stand-in operator.
 
 
-def is_close(frame: OperatorFrame | None, place: tuple[float, float, float], within: float) -> bool:
+def is_close(frame: OperatorFrame | None, place: Sequence[float], within: float) -> bool:
     return frame is not None and bool(np.linalg.norm(frame.head[:3] - place) < within)
 
 
@@ -508,7 +508,7 @@ def test_poses_of_a_headset_come_out_in_our_convention(desk, open_at):
     page.evaluate("(pose) => { wearer.pose = pose; wearer.pinch = [1, 0]; }", poses)
     moved = [-1.0, -0.5, 1.4]
     # A head that jumps is believed once it has stayed there.
-    wait_for(lambda: is_close(desk.frame, tuple(moved), 0.01) and desk.frame.tracked.all(), "it")
+    wait_for(lambda: is_close(desk.frame, moved, 0.01) and desk.frame.tracked.all(), "it")
     page.evaluate("() => { wearer.still = true; }")
     truth = {
         name: np.reshape(matrix, (4, 4)).T for name, matrix in page.evaluate(READ_TRUTH).items()
@@ -539,8 +539,8 @@ def test_what_the_wearer_sees(desk, open_at):
     page.wait_for_function("() => app.headset.stage.aspect > 0")
     page.wait_for_timeout(300)
     picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), int)
-    red = (np.abs(picture - (200, 40, 40)) < 14).all(axis=2)
-    green = (np.abs(picture - (40, 170, 60)) < 14).all(axis=2)
+    red = np.all(np.abs(picture - (200, 40, 40)) < 14, axis=2)
+    green = np.all(np.abs(picture - (40, 170, 60)) < 14, axis=2)
     columns = [np.flatnonzero(mask.any(axis=0)) for mask in (red, green)]
     half = picture.shape[1] // 2
     for low, high in ((0, half), (half, 2 * half)):  # one for each eye, the right way round

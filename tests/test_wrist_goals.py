@@ -18,9 +18,9 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
 
-HEAD = make_pose([0.1, 0.2, 1.2], quat_from_rpy(0.1, 0.2, 0.3))
-LEFT = make_pose([0.5, 0.4, 0.9], quat_from_rpy(0.5, -0.2, 0.4))
-RIGHT = make_pose([0.4, -0.1, 1.0], quat_from_rpy(-0.5, 0.1, 0.2))
+HEAD = make_pose(np.array([0.1, 0.2, 1.2]), quat_from_rpy(0.1, 0.2, 0.3))
+LEFT = make_pose(np.array([0.5, 0.4, 0.9]), quat_from_rpy(0.5, -0.2, 0.4))
+RIGHT = make_pose(np.array([0.4, -0.1, 1.0]), quat_from_rpy(-0.5, 0.1, 0.2))
 GOALS = {"head": HEAD, "left_wrist": LEFT, "right_wrist": RIGHT}
 
 offsets = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
@@ -44,7 +44,7 @@ def carry(pose: np.ndarray, head: np.ndarray) -> np.ndarray:
 
 
 def _forward(pose: np.ndarray) -> np.ndarray:
-    return pose_multiply(pose, make_pose([1, 0, 0], [1, 0, 0, 0]))[:3] - pose[:3]
+    return pose_multiply(pose, np.array([1, 0, 0, 1, 0, 0, 0]))[:3] - pose[:3]
 
 
 def test_at_the_goal_the_wrists_are_where_the_operator_has_them():
@@ -114,7 +114,7 @@ def test_the_distance_can_be_chosen(max_offset):
 
 def test_goals_are_left_untouched():
     copies = {name: pose.copy() for name, pose in GOALS.items()}
-    compute_wrist_goals(GOALS, make_pose([1, 1, 1], quat_exp([0.1, 0.2, 0.3])))
+    compute_wrist_goals(GOALS, make_pose(np.array([1, 1, 1]), quat_exp(np.array([0.1, 0.2, 0.3]))))
     for name, pose in copies.items():
         np.testing.assert_array_equal(GOALS[name], pose)
 
@@ -125,7 +125,7 @@ def test_a_head_that_bends_down_past_the_vertical_makes_no_hand_jump(roll):
     before = None
     for nod in np.linspace(0.0, 2.2, 111):
         head = make_pose(HEAD[:3], quat_from_rpy(roll, nod, 0.3))
-        robot = make_pose([0.0, 0.0, 1.1], quat_from_rpy(roll, 0.9 * nod, 0.3))
+        robot = make_pose(np.array([0.0, 0.0, 1.1]), quat_from_rpy(roll, 0.9 * nod, 0.3))
         wrists = compute_wrist_goals({**GOALS, "head": head}, robot)
         if before is not None:
             for name, wrist in wrists.items():

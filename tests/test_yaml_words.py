@@ -49,12 +49,19 @@ def parse(*flags: str) -> Flags:
     return decode(Flags, deflatten(values, sep="."))
 
 
+def get_robot(flags: Flags) -> XopG1Config:
+    assert isinstance(flags.robot, XopG1Config)
+    return flags.robot
+
+
 def robot(*flags: str) -> XopG1Config:
-    return parse(*(f"--robot.{flag}" for flag in flags)).robot
+    return get_robot(parse(*(f"--robot.{flag}" for flag in flags)))
 
 
 def teleop(*flags: str) -> XopConfig:
-    return parse(*(f"--teleop.{flag}" for flag in flags)).teleop
+    teleop = parse(*(f"--teleop.{flag}" for flag in flags)).teleop
+    assert isinstance(teleop, XopConfig)
+    return teleop
 
 
 # -- LeRobot's flags and files ---------------------------------------------------------------
@@ -73,11 +80,11 @@ def test_every_noise_can_be_typed(word):
 def test_the_same_through_the_whole_parser_and_from_a_file(tmp_path):
     path = tmp_path / "record.yaml"
     path.write_text("robot:\n  type: xop_g1\n  sim:\n    noise: off\n  session: null\n")
-    from_file = draccus.parse(Flags, config_path=path, args=[TYPES[1]]).robot
+    from_file = get_robot(draccus.parse(Flags, config_path=path, args=[TYPES[1]]))
     assert (from_file.sim.noise, from_file.session) == ("off", "default")
     path.write_text("robot:\n  type: xop_g1\n  sim:\n    noise: harsh\n")
     flags = [*TYPES, "--robot.sim.noise=off"]
-    assert draccus.parse(Flags, config_path=path, args=flags).robot.sim.noise == "off"
+    assert get_robot(draccus.parse(Flags, config_path=path, args=flags)).sim.noise == "off"
 
 
 @pytest.mark.parametrize("word", ["on", "yes", "true"])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 # LeRobot makes a calibration folder for every robot and reads its place at import.
 os.environ.setdefault("HF_LEROBOT_HOME", tempfile.mkdtemp(prefix="lerobot-"))
@@ -22,6 +22,8 @@ from lerobot_robot_xop.config_xop import XopRobotConfig
 from lerobot_robot_xop.xop_robot import XopRobot
 from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
+from xop_lerobot.core.state import RobotState
+from xop_lerobot.link import get_session
 from xop_lerobot.low_level.factory import POLICIES
 from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
 from xop_lerobot.morphology.effect import Acts, Effect
@@ -79,10 +81,10 @@ class Toy(Morphology):
         )
     )
     policies = ("toy_hold",)
-    frames: ClassVar = {name: name for name in ("head", "left_wrist", "right_wrist")}
+    frames = {name: name for name in ("head", "left_wrist", "right_wrist")}
     base_body = "box"
     arms = tuple(ArmChain(f"{side}_wrist", (f"{side}_shoulder", f"{side}_elbow")) for side in SIDES)
-    arm_rest: ClassVar = {}
+    arm_rest = {}
     contact_points = ("foot_0", "foot_1", "foot_2", "foot_3")
     contact_groups = (contact_points,)
     effects = (Effect(Acts.JOINT, joint="lift", lag_s=0.1), Effect(Acts.TURN, modes=()))
@@ -136,7 +138,19 @@ class XopToy(XopRobot):
     name = "xop_toy"
 
 
-SMALL = {"width": 64, "height": 48}
+def get_state(robot: XopRobot) -> RobotState:
+    """What the robot has published last."""
+    state = get_session(robot.config.session).state
+    assert state is not None
+    return state
+
+
+def observe(robot: XopRobot) -> RobotState:
+    robot.get_observation()
+    return get_state(robot)
+
+
+SMALL: dict[str, Any] = {"width": 64, "height": 48}
 
 
 def make_toy(session: str, **settings) -> XopToy:
@@ -146,7 +160,7 @@ def make_toy(session: str, **settings) -> XopToy:
 
 def make_teleop(session: str, retargeter: str = "direct", **device) -> Xop:
     """A teleoperator that plays a built-in script."""
-    settings = {"type": "scripted", "path": "g1_squat_walk_reach"} | device
+    settings: dict[str, Any] = {"type": "scripted", "path": "g1_squat_walk_reach", **device}
     return Xop(
         XopConfig(
             session=session,
