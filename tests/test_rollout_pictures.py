@@ -14,6 +14,7 @@ from lerobot.scripts import lerobot_rollout
 from test_host import ForeignRobotConfig
 from toy_robot import XopToyConfig
 
+from lerobot_robot_xop import XopRobotConfig
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.dataset.rollout_pictures import watch_rollouts
 
@@ -94,7 +95,7 @@ def test_it_is_wrapped_once(built):
 
 def test_a_lerobot_that_has_changed_is_said(monkeypatch, caplog):
     monkeypatch.delattr(lerobot_rollout, "build_rollout_context")
-    watch_rollouts()
+    watch_rollouts(XopRobotConfig)
     assert caplog.messages == [
         "LeRobot has changed (lerobot.scripts.lerobot_rollout has no build_rollout_context), so "
         "nobody compares a policy's pictures with the robot's."

@@ -100,7 +100,7 @@ class XopRobotConfig(RobotConfig):
         if len(set(self.cameras)) < len(self.cameras):
             raise BadValue(f"robot.cameras names a camera twice: {', '.join(self.cameras)}")
         self.make_simulation_config()
-        watch_rollouts()
+        watch_rollouts(XopRobotConfig)
 
     @property
     def scene(self) -> str:

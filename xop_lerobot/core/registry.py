@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import cast
 
 from xop_lerobot.core.errors import DuplicateName, UnknownName
@@ -57,8 +57,7 @@ class Registry[T]:
         if name not in self:
             raise UnknownName(self.kind, name, self)
         if name not in self._things:
-            module, _, attribute = self._places[name].partition(":")
-            self._things[name] = getattr(import_module(module), attribute)
+            self._things[name] = resolve_name(self._places[name])
         return self._things[name]
 
     def __contains__(self, name: object) -> bool:

@@ -7,7 +7,7 @@ import importlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from xop_lerobot.core.errors import BadValue
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from lerobot_robot_xop import XopRobotConfig
     from lerobot_teleoperator_xop import XopConfig
     from xop_lerobot.dataset.collect_folder import Attempt
-    from xop_lerobot.dataset.collect_worker import Collector
     from xop_lerobot.morphology.morphology import Morphology
     from xop_lerobot.tasks.task import Task
 
@@ -64,6 +63,10 @@ class CollectConfig:
     device: str = "simulated"
     plugins: tuple[str, ...] = ()
 
+    maker: ClassVar[str] = "xop_lerobot.dataset.collect_worker:Collector"
+    """Class that makes the episodes in a worker, from the configuration and when the run began
+    [s since the epoch]; it brings torch, which who only asks for a plan can do without."""
+
     def check(self) -> None:
         """Check all that can be checked before a robot is made; imports the plugins.
 
@@ -89,16 +92,6 @@ class CollectConfig:
     def describe(self, attempt: Attempt) -> str:
         """Say in a few words what came of an episode."""
         return "success" if attempt.success else attempt.failure or "no success"
-
-    def make_maker(self, run: float) -> Collector:
-        """Make what makes the episodes, in a worker of its own.
-
-        Args:
-            run: When the run began [s since the epoch].
-        """
-        from xop_lerobot.dataset.collect_worker import Collector  # noqa: PLC0415 torch
-
-        return Collector(self, run)
 
     @property
     def morphology(self) -> Morphology:

@@ -17,6 +17,7 @@ from collections.abc import Generator, Iterable
 from contextlib import closing
 from functools import cached_property
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from xop_lerobot.core.errors import XopError
@@ -96,7 +97,7 @@ class _Job:
     @cached_property
     def maker(self) -> Collector:
         """What makes them."""
-        return self.config.make_maker(self.run)
+        return resolve_name(self.config.maker)(self.config, self.run)
 
 
 @dataclasses.dataclass

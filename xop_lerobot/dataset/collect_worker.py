@@ -21,7 +21,7 @@ from lerobot.utils.import_utils import make_device_from_device_class
 from xop_lerobot.dataset.collect_config import CollectConfig, import_plugins
 from xop_lerobot.dataset.collect_folder import DATASET, Attempt
 from xop_lerobot.dataset.collect_jobs import get_index
-from xop_lerobot.dataset.host import count_ticks
+from xop_lerobot.dataset.lockstep import count_ticks
 from xop_lerobot.dataset.record import build_features
 from xop_lerobot.dataset.tick import run_tick
 from xop_lerobot.dataset.xop_dataset import XopDataset

@@ -14,12 +14,12 @@ import logging
 import math
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from xop_lerobot.core.errors import LinkError
+from xop_lerobot.dataset.lockstep import count_ticks, without_slowness
 from xop_lerobot.dataset.shutdown import TermAsInterrupt
 from xop_lerobot.link import get_session
 
@@ -54,10 +54,6 @@ _META_SIGNATURES = {
 }
 _LOOP_PARAMETERS = ("robot", "events", "dataset", "teleop", "control_time_s")
 """Parameters of `record_loop` that the replacement reads or changes."""
-_SLOWNESS = "loop is running slower"
-"""Of LeRobot's warning of a slow tick: of the "Record loop", later of the "Control loop"."""
-_WARNERS = (None, "lerobot.rollout.strategies.episodic", "lerobot.utils.cycle_timer")
-"""Loggers that may give it, by LeRobot's version and command; None is the root."""
 
 
 class Host:
@@ -176,28 +172,6 @@ class Host:
             return get_session(self._session).robot.name == getattr(robot, "name", None)
         except LinkError:
             return False
-
-
-@contextmanager
-def without_slowness() -> Iterator[None]:
-    """Leave out LeRobot's warning of every slow tick: in lock-step none is wrong, only later."""
-
-    def is_other(record: logging.LogRecord) -> bool:
-        return _SLOWNESS not in str(record.msg)
-
-    warners = [logging.getLogger(name) for name in _WARNERS]
-    for warner in warners:
-        warner.addFilter(is_other)
-    try:
-        yield
-    finally:
-        for warner in warners:
-            warner.removeFilter(is_other)
-
-
-def count_ticks(duration: float, fps: int) -> int:
-    """Count the frames of an episode of `duration` [s] at `fps` [Hz], at least one."""
-    return max(1, round(duration * fps))
 
 
 def find(name: str) -> ModuleType | None:

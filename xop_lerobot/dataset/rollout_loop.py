@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.dataset.host import count_ticks, without_slowness
+from xop_lerobot.dataset.lockstep import count_ticks, without_slowness
 from xop_lerobot.dataset.xop_dataset import XopDataset
 from xop_lerobot.link import get_session
 

@@ -30,8 +30,12 @@ _RESIZING = (
 """Settings of LeRobot's policies that bring pictures of any size to one."""
 
 
-def watch_rollouts() -> None:
-    """Let `lerobot-rollout`, if that is what runs, check the sizes of pictures first."""
+def watch_rollouts(ours: type[XopRobotConfig]) -> None:
+    """Let `lerobot-rollout`, if that is what runs, check the sizes of pictures first.
+
+    Args:
+        ours: Configuration of the robots whose pictures are compared.
+    """
     module = find(COMMAND_MODULE)
     if module is None:
         return
@@ -51,9 +55,7 @@ def watch_rollouts() -> None:
     @functools.wraps(stock)
     def build(cfg: Any, *args: Any, **kwargs: Any) -> Any:
         """Check the pictures of an xop robot, then do what LeRobot does."""
-        from lerobot_robot_xop.config_xop import XopRobotConfig  # noqa: PLC0415  imports this
-
-        if isinstance(cfg.robot, XopRobotConfig):
+        if isinstance(cfg.robot, ours):
             check_pictures(cfg.robot, cfg.policy, getattr(cfg, "rename_map", None) or {})
         return stock(cfg, *args, **kwargs)
 

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.yaml_words import load_yaml
@@ -15,7 +15,6 @@ from xop_lerobot.dataset.collect_config import CollectConfig, import_plugins
 if TYPE_CHECKING:
     from lerobot_teleoperator_xop import XopConfig
     from xop_lerobot.dataset.collect_folder import Attempt
-    from xop_lerobot.dataset.curate.retarget_worker import Retargeter
 
 DEVICE = "retarget"
 """Name of the device that plays the recorded operators."""
@@ -48,6 +47,8 @@ class RetargetConfig(CollectConfig):
     weights: Mapping[str, float] = field(default_factory=dict)
     retargeter: Mapping[str, Any] = field(default_factory=dict)
     alignment: Mapping[str, Any] = field(default_factory=dict)
+
+    maker: ClassVar[str] = "xop_lerobot.dataset.curate.retarget_worker:Retargeter"
 
     def check(self) -> None:
         """Check all that can be checked before a robot is made; imports the plugins.
@@ -88,12 +89,6 @@ class RetargetConfig(CollectConfig):
         if not attempt.kept:
             return f"left out ({attempt.failure})"
         return super().describe(attempt) if self.task else "retargeted"
-
-    def make_maker(self, run: float) -> Retargeter:
-        """Make what makes the episodes, in a worker of its own."""
-        from xop_lerobot.dataset.curate.retarget_worker import Retargeter  # noqa: PLC0415 torch
-
-        return Retargeter(self, run)
 
 
 def choose_fps(wanted: int, source: float) -> int:
