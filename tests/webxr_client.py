@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from xop_lerobot.core.transforms import quat_from_matrix
-from xop_lerobot.operator.devices.axes import WORLD
+from xop_lerobot.operator.axes import WORLD
 from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.frame import OperatorFrame
 

@@ -9,7 +9,6 @@ from collections.abc import Callable
 import grpc
 
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.operator.devices.address import find_own_address
 from xop_lerobot.operator.devices.avp_protocol import (
     METHOD,
     PORT,
@@ -20,6 +19,7 @@ from xop_lerobot.operator.devices.avp_protocol import (
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.live import LiveDevice, StreamLost
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.webxr.addresses import find_own_address
 from xop_lerobot.operator.webxr.pairing import MAX_RATE, RateLimit
 
 MAX_MESSAGE = 256 * 1024

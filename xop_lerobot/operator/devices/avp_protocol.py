@@ -14,7 +14,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError, Message
 
 from xop_lerobot.core.transforms import make_pose, quat_from_matrix
-from xop_lerobot.operator.devices.axes import WORLD
+from xop_lerobot.operator.axes import WORLD
 from xop_lerobot.operator.frame import OperatorFrame
 
 SERVICE = "handtracking.HandTrackingService"

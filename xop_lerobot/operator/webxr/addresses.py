@@ -7,8 +7,6 @@ import socket
 
 import psutil
 
-from xop_lerobot.operator.devices.address import find_own_address
-
 LOOPBACKS = ("127.0.0.1", "::1")
 ANY = ("0.0.0.0", "::")
 """Listening there is listening at every address."""
@@ -56,3 +54,14 @@ def make_url(scheme: str, host: str, port: int, code: str = "") -> str:
     """Address of a page."""
     shown = f"[{host}]" if ":" in host else host
     return f"{scheme}://{shown}:{port}/{f'?code={code}' if code else ''}"
+
+
+def find_own_address(target: str) -> str:
+    """Our own IPv4 address on the way to `target` (host:port); nothing is sent."""
+    host, _, port = target.rpartition(":")
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((host, int(port)))
+            return str(probe.getsockname()[0])
+    except OSError:
+        return "0.0.0.0"  # the connection will fail too, and say why

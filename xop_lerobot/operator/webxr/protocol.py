@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from xop_lerobot.core.transforms import make_pose, quat_from_matrix, quat_multiply, quat_rotate
-from xop_lerobot.operator.devices.axes import WORLD
+from xop_lerobot.operator.axes import WORLD
 from xop_lerobot.operator.display import Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.stream_guard import NORM_TOLERANCE, OPEN_PINCH
