@@ -1,6 +1,6 @@
 r"""Distil FALCON's G1 policy into the student that ships with the package.
 
-    python scripts/distill_low_level.py --teacher g1_29dof.onnx --seed 0 \
+    python -m scripts.distill_low_level --teacher g1_29dof.onnx --seed 0 \
         --out xop_lerobot/low_level/weights/g1_student.npz
 
 DAgger (Ross et al., 2011): many robots run in the planning model; each is driven by the teacher
@@ -20,22 +20,22 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
-from low_level_teacher import ACTIONS, ARMS, GRAVITY, JOINTS, Teacher
 from torch import nn
 
-from xop_lerobot.core.command import Mode
-from xop_lerobot.core.command_line import make_output_readable
-from xop_lerobot.core.errors import BadValue
-from xop_lerobot.low_level.excitation import (
+from benchmarks.low_level_excitation import (
     VELOCITIES,
     Excitation,
     ExcitationConfig,
     make_excitation,
 )
+from benchmarks.low_level_trial import BatchSimulation
+from scripts.low_level_teacher import ACTIONS, ARMS, GRAVITY, JOINTS, Teacher
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import BadValue
 from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.low_level.tables import load_policy
-from xop_lerobot.low_level.trial import BatchSimulation
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 

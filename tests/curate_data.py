@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 
-from xop_lerobot.dataset.curate.synthetic import make_dataset
+from benchmarks.curate_synthetic import make_dataset
 from xop_lerobot.dataset.schedule import keep_schedule
 
 SIZE = 32

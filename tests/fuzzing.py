@@ -1,8 +1,8 @@
 """Garbage for every port that is open: it goes in, and nothing else changes.
 
 What is attacked runs in a process of its own (`Subject`), whose memory, threads and files are
-counted; a stream or client that behaves well goes on beside. `scripts/fuzz_ports.py` is the long
-run, `test_fuzz_ports.py` a short one.
+counted; a stream or client that behaves well goes on beside. `benchmarks/run_fuzz_ports.py` is the
+long run, `test_fuzz_ports.py` a short one.
 """
 
 from __future__ import annotations

@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "benchmark_sync.py"
-
-
-@pytest.fixture(scope="module")
-def benchmark():
-    spec = importlib.util.spec_from_file_location("xop_benchmark_sync", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+from benchmarks import run_sync as benchmark
 
 
 @pytest.mark.parametrize("case", ["g1 stands", "rby1 drives"])
-def test_synchronised_states_predict_better_than_raw_ones(benchmark, case, capsys):
+def test_synchronised_states_predict_better_than_raw_ones(case, capsys):
     errors = {name: benchmark.Errors() for name in ("raw", *benchmark.VARIANTS)}
     benchmark.run(benchmark.CASES[case], "mild", 0, 6.0, errors)
     benchmark.print_table(case, errors)
@@ -38,7 +23,7 @@ def test_synchronised_states_predict_better_than_raw_ones(benchmark, case, capsy
     assert np.mean(best.position) < 0.4 * np.mean(raw.position)
 
 
-def test_without_noise_a_prediction_from_the_raw_state_is_the_true_one(benchmark):
+def test_without_noise_a_prediction_from_the_raw_state_is_the_true_one():
     errors = {name: benchmark.Errors() for name in ("raw", *benchmark.VARIANTS)}
     benchmark.run(benchmark.CASES["rby1 stands"], "off", 0, 2.5, errors)
     assert max(errors["raw"].predicted[10]) == 0

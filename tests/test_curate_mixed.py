@@ -1,7 +1,7 @@
 """The verbs on sessions of mixed episodes of a G1 in simulation: each does the right thing.
 
 One is whole, two were killed: those are restored, merged, labelled and split. They are made by
-`scripts/make_mixed_dataset.py`.
+`benchmarks/run_make_mixed_dataset.py`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ EPISODES = 10
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("mixed")
-    script = [sys.executable, "scripts/make_mixed_dataset.py", "--out", str(out)]
+    script = [sys.executable, "-m", "benchmarks.run_make_mixed_dataset", "--out", str(out)]
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(

@@ -1,4 +1,4 @@
-"""Garbage at every port that is open; `scripts/fuzz_ports.py` is the same with more of it."""
+"""Garbage at every port that is open; `benchmarks/run_fuzz_ports.py` sends more of it."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from xop_lerobot.evaluation.planner import SETTINGS, make_planner_table, measure_planners
+from benchmarks.planner import SETTINGS, make_planner_table, measure_planners
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.kmppi import Kmppi
 from xop_lerobot.retarget.sampling import DRAWS

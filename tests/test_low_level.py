@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 import requests
 
+from benchmarks.low_level_comparison import make_simulation
+from benchmarks.low_level_excitation import ExcitationConfig, make_excitation
+from benchmarks.low_level_trial import BatchSimulation, run_trials
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadShape, BadValue, PolicyFileError, UnknownName
 from xop_lerobot.core.transforms import (
@@ -22,15 +25,12 @@ from xop_lerobot.core.transforms import (
     quat_to_rpy,
 )
 from xop_lerobot.low_level import policy_file
-from xop_lerobot.low_level.comparison import make_simulation
 from xop_lerobot.low_level.diff_drive import DiffDrive, compute_wheel_speeds
-from xop_lerobot.low_level.excitation import ExcitationConfig, make_excitation
 from xop_lerobot.low_level.factory import POLICIES, make_policy
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
 from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
 from xop_lerobot.low_level.tables import find_table, load_policy, read_table
-from xop_lerobot.low_level.trial import BatchSimulation, run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 
@@ -77,7 +77,7 @@ def make_inputs(policy: LowLevelPolicy, n: int, seed: int = 0) -> Inputs:
     return qpos, qvel, command, arms, memory
 
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+ROOT = Path(__file__).parents[1]
 
 
 def test_unknown_policy_is_named_with_the_known_ones() -> None:
@@ -361,10 +361,9 @@ def test_g1_stands_with_arms_anywhere() -> None:
     simulation.close()
 
 
-def test_balance_stands_without_falcon(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_balance_stands_without_falcon() -> None:
     """The teacher's own balance: at its height, leaning, under forces, and dead still."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    from low_level_teacher import Balance
+    from scripts.low_level_teacher import Balance
 
     n, balance = 4, Balance()
     rest = make_morphology("g1").rest_action().arms
@@ -391,10 +390,9 @@ def test_balance_stands_without_falcon(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation.close()
 
 
-def test_teacher_steps_when_pushed_and_stands_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_teacher_steps_when_pushed_and_stands_again() -> None:
     """A push out of the support is FALCON's; once the feet are still the balance acts again."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    from low_level_teacher import ACTIONS, Teacher
+    from scripts.low_level_teacher import ACTIONS, Teacher
 
     teacher, simulation = Teacher(find_teacher()), make_simulation(2, threads=1)
     rest = np.tile(make_morphology("g1").rest_action().arms, (2, 1))
@@ -420,11 +418,11 @@ def test_teacher_steps_when_pushed_and_stands_again(monkeypatch: pytest.MonkeyPa
     simulation.close()
 
 
-def test_skip_is_folded_into_the_layers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_skip_is_folded_into_the_layers(tmp_path: Path) -> None:
     """A saved student does what the one in training did, and can be trained further."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
     import torch
-    from distill_low_level import Network
+
+    from scripts.distill_low_level import Network
 
     torch.manual_seed(0)
     observations = torch.randn(50, 575) * torch.rand(575)
@@ -637,9 +635,11 @@ def test_distillation_runs_from_a_teacher_file(tmp_path: Path) -> None:
     """The script makes loadable weights."""
     out = tmp_path / "student.npz"
     small = "--robots 8 --steps 20 --updates 3 --final-updates 2 --batch 32 --rounds 1"
-    script = str(SCRIPTS / "distill_low_level.py")
-    command = [sys.executable, script, "--teacher", find_teacher(), *small.split()]
-    subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, timeout=300)
+    script = [sys.executable, "-m", "scripts.distill_low_level"]
+    command = [*script, "--teacher", find_teacher(), *small.split()]
+    subprocess.run(
+        [*command, "--out", str(out)], check=True, capture_output=True, timeout=300, cwd=ROOT
+    )
     weights, _ = load_weights(out)
     assert [w.shape for w in weights] == [(575, 541), (541, 285), (285, 29)]
 
@@ -648,12 +648,17 @@ def test_benchmark_of_policies_writes_a_table(tmp_path: Path) -> None:
     """Policies side by side; what the file of results holds is not run again."""
     page, results = tmp_path / "page.md", tmp_path / "results.json"
     page.write_text("a\n<!-- policies -->\nold\n<!-- end of policies -->\nb\n")
-    script = str(SCRIPTS / "benchmark_policies.py")
-    command = [sys.executable, script, "--trials", "2", "--seconds", "1", "--json", str(results)]
+    script = [sys.executable, "-m", "benchmarks.run_policies"]
+    command = [*script, "--trials", "2", "--seconds", "1", "--json", str(results)]
     command += ["--policies", "default", str(find_table("default")), "--docs", str(page)]
     for parts in ("sequences", "speed,sequences"):
         done = subprocess.run(
-            [*command, "--parts", parts], check=True, capture_output=True, text=True, timeout=300
+            [*command, "--parts", parts],
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            cwd=ROOT,
         )
     assert "sequences done" not in done.stderr
     facts = json.loads(results.read_text())
@@ -665,7 +670,12 @@ def test_benchmark_of_policies_writes_a_table(tmp_path: Path) -> None:
     assert "| the published ranges | 0 · " in table
     assert "| batch of 30 | " in table
     wrong = subprocess.run(
-        [*command, "--parts", "spead"], check=False, capture_output=True, text=True, timeout=300
+        [*command, "--parts", "spead"],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=ROOT,
     )
     assert wrong.stderr == (
         "error: unknown part 'spead'. Known: arms, commands, mpc, sequences, speed\n"

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from reached import collect_reach
 
-from xop_lerobot.core.errors import BadDataset, BadValue
-from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.evaluation.policy_error import (
+from benchmarks.policy_error import (
     Hands,
     Setting,
     compute_best_blind_error,
@@ -19,6 +17,8 @@ from xop_lerobot.evaluation.policy_error import (
     read_hands,
     stand_still,
 )
+from xop_lerobot.core.errors import BadDataset, BadValue
+from xop_lerobot.dataset.facts import read_facts
 
 SETTING = Setting("rby1", "dual_point_reach", "empty", "mild", "diff_drive", fps=25, seed=0)
 

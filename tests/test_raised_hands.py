@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.person_comparison import simulate_frames
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import (
     make_pose,
@@ -26,7 +27,6 @@ from xop_lerobot.operator.gestures import GestureConfig
 from xop_lerobot.operator.hands import Hands, explain_gestures
 from xop_lerobot.operator.raised_hands import RaisedHands, RaisedHandsConfig
 from xop_lerobot.operator.recording import load_recording
-from xop_lerobot.operator.simulated.comparison import simulate_frames
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[2] / "shared"))
 RATE = 50

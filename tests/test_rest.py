@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
+from benchmarks.low_level_comparison import make_simulation, measure_rest
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.transforms import compute_projected_gravity, quat_exp, quat_from_yaw
-from xop_lerobot.low_level.comparison import make_simulation, measure_rest
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.low_level.rest import RestMap
 from xop_lerobot.morphology.morphology import make_morphology

@@ -6,6 +6,30 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.tracking_metrics import (
+    Trajectory,
+    compute_errors,
+    compute_metrics,
+    compute_step_metrics,
+)
+from benchmarks.tracking_scenarios import (
+    ROOM_HALF,
+    SCENARIO_GROUPS,
+    SCENARIOS,
+    GoalStep,
+    GoalTrack,
+    Tolerance,
+)
+from benchmarks.tracking_setup import (
+    ABLATIONS,
+    TrackingSetup,
+    compute_policy_steps,
+    make_retargeter_config,
+    make_tuned_morphology,
+    override_config,
+    parse_overrides,
+    resolve_configs,
+)
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 from xop_lerobot.core.transforms import (
@@ -15,36 +39,14 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
     quat_yaw,
 )
-from xop_lerobot.evaluation.tracking_metrics import (
-    Trajectory,
-    compute_errors,
-    compute_metrics,
-    compute_step_metrics,
-)
-from xop_lerobot.evaluation.tracking_scenarios import (
+from xop_lerobot.evaluation.bench import (
     CURVE_SPEED,
     CURVE_TURN,
     LEAD_IN_S,
-    ROOM_HALF,
-    SCENARIO_GROUPS,
-    SCENARIOS,
     WAIST,
-    GoalStep,
-    GoalTrack,
-    Tolerance,
     bend_from,
     make_curve,
     move_from,
-)
-from xop_lerobot.evaluation.tracking_setup import (
-    ABLATIONS,
-    TrackingSetup,
-    compute_policy_steps,
-    make_retargeter_config,
-    make_tuned_morphology,
-    override_config,
-    parse_overrides,
-    resolve_configs,
 )
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.retarget.config import RetargeterConfig

@@ -1,7 +1,6 @@
 """The tracking benchmark in closed loop: its device, its file, its tables and its script."""
 
 import dataclasses
-import importlib.util
 import json
 import math
 import re
@@ -10,12 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from xop_lerobot.core.command import Mode
-from xop_lerobot.core.errors import BadValue, UnknownName
-from xop_lerobot.core.transforms import make_pose, pose_inverse, pose_multiply, quat_from_yaw
-from xop_lerobot.evaluation import tracking
-from xop_lerobot.evaluation.bench_report import make_table
-from xop_lerobot.evaluation.tracking import (
+from benchmarks import run_tracking as script
+from benchmarks import tracking
+from benchmarks.tracking import (
     GoalDevice,
     WorldAlignment,
     get_scenario,
@@ -23,8 +19,8 @@ from xop_lerobot.evaluation.tracking import (
     run_scenario,
     run_trial,
 )
-from xop_lerobot.evaluation.tracking_documents import ASKED, ROBOTS, make_blocks, write_documents
-from xop_lerobot.evaluation.tracking_report import (
+from benchmarks.tracking_documents import ASKED, ROBOTS, make_blocks, write_documents
+from benchmarks.tracking_report import (
     Results,
     compute_median_and_worst,
     describe_run,
@@ -34,17 +30,20 @@ from xop_lerobot.evaluation.tracking_report import (
     make_scenario_table,
     read_runs,
 )
-from xop_lerobot.evaluation.tracking_scenarios import (
-    LEAD_IN_S,
+from benchmarks.tracking_scenarios import (
     SCENARIO_GROUPS,
     SCENARIOS,
     GoalStep,
     GoalTrack,
     Scenario,
     Tolerance,
-    move_from,
 )
-from xop_lerobot.evaluation.tracking_setup import ABLATIONS, TrackingSetup, resolve_configs
+from benchmarks.tracking_setup import ABLATIONS, TrackingSetup, resolve_configs
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.transforms import make_pose, pose_inverse, pose_multiply, quat_from_yaw
+from xop_lerobot.evaluation.bench import LEAD_IN_S, move_from
+from xop_lerobot.evaluation.bench_report import make_table
 from xop_lerobot.morphology.morphology import make_morphology
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -65,17 +64,6 @@ def short(monkeypatch):
     scenario = Scenario("short", "short", Mode.STATIONARY, build_short, tolerances=tolerances)
     monkeypatch.setitem(SCENARIOS, "short", scenario)
     return TrackingSetup("rby1", "short", overrides=SMALL)
-
-
-@pytest.fixture(scope="module")
-def script():
-    path = ROOT / "scripts" / "benchmark_tracking.py"
-    spec = importlib.util.spec_from_file_location("benchmark_tracking", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 # -- the loop ------------------------------------------------------------------------------------
@@ -383,7 +371,7 @@ def test_a_table_is_markdown():
 # -- the script ----------------------------------------------------------------------------------
 
 
-def test_the_script_resumes(script, tmp_path, monkeypatch, capsys):
+def test_the_script_resumes(tmp_path, monkeypatch, capsys):
     ran = []
 
     def fake(setup, seed):
@@ -410,7 +398,7 @@ def test_the_script_resumes(script, tmp_path, monkeypatch, capsys):
     assert len(ran) == 2  # other settings, another run
 
 
-def test_the_script_names_what_it_does_not_know(script, monkeypatch, capsys):
+def test_the_script_names_what_it_does_not_know(monkeypatch, capsys):
     for flags, text in (
         (["--scenarios", "jump"], "unknown scenario 'jump'. Known: "),
         (["--ablations", "none"], "unknown ablation 'none'. Known: "),
@@ -423,7 +411,7 @@ def test_the_script_names_what_it_does_not_know(script, monkeypatch, capsys):
         assert text in capsys.readouterr().err
 
 
-def test_the_script_draws_a_run(script, short, tmp_path, monkeypatch, capsys):
+def test_the_script_draws_a_run(short, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     picture = tmp_path / "run.png"
     flags = ["--robot", short.robot, "--scenarios", "short", "--set", "num_samples=2"]
@@ -433,7 +421,7 @@ def test_the_script_draws_a_run(script, short, tmp_path, monkeypatch, capsys):
     assert "rby1/short/default/0: at 1.5 s [cm]" in capsys.readouterr().out
 
 
-def test_two_processes_give_the_runs_of_one(script, tmp_path, monkeypatch):
+def test_two_processes_give_the_runs_of_one(tmp_path, monkeypatch):
     flags = ["--robot", "rby1", "--scenarios", "quarter", "--hold", "0", "--seeds", "2"]
     flags += ["--set", "horizon=1", "--set", "num_samples=2"]
     runs = []

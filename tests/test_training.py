@@ -196,7 +196,7 @@ def test_it_drives_the_robot_and_is_evaluated(policy, tmp_path, monkeypatch):
     # In lock-step the same policy does the same with the same seeds.
     assert np.array_equal(one, two)
 
-    command = [sys.executable, REPO / "scripts" / "evaluate_policy.py", "--at", "1", "--json"]
+    command = [sys.executable, "-m", "benchmarks.run_evaluate_policy", "--at", "1", "--json"]
     command += [tmp_path / "out.json", "--rollouts", f"one={tmp_path / 'one'}"]
     command += [f"two={tmp_path / 'two'}", "--margin", "0.01"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=REPO)

@@ -14,9 +14,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -30,14 +31,20 @@ from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.core.state import Goal, RobotState
-from xop_lerobot.core.transforms import make_pose
+from xop_lerobot.core.transforms import (
+    make_pose,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+)
 from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
-from xop_lerobot.evaluation.tracking_scenarios import bend_from, make_curve
 from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.goal_velocity import GoalVelocity
+from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.plant.config import NOISE_PRESETS, SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
@@ -47,6 +54,19 @@ from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.rollout import PolicyRollout
 from xop_lerobot.retarget.state_sync import StateSync
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+
+LEAD_IN_S = 1.0
+"""Time for which the first goal is the pose at home [s]."""
+CURVE_SPEED = 0.3
+"""Speed of the moving goal [m/s]."""
+CURVE_TURN = 0.3
+"""Largest turn rate of the moving goal [rad/s]: a radius of 1 m."""
+CURVE_PERIOD = 16.0
+"""Time in which the moving goal turns left and right once [s]."""
+CURVE_S = 20.0
+"""Length of the moving goal's path [s]."""
+WAIST = np.array([-0.05, 0.0, -0.42])
+"""Where a person's waist is from the head, in the heading frame [m]: bends turn about it."""
 
 
 @dataclass(frozen=True)
@@ -245,6 +265,51 @@ def _time_solves(
             rows.append(times)
         loop.execute(RobotAction(plan.command, mode, state.arms), period)
     return rows
+
+
+def move_from(home: np.ndarray, offset: tuple[float, float, float], yaw: float = 0) -> np.ndarray:
+    """Pose that is `offset` [m] and `yaw` [rad] away from home, in its heading frame. (7,)."""
+    heading = quat_from_yaw(compute_heading(home[3:]))
+    position = home[:3] + quat_rotate(heading, np.array(offset))
+    return make_pose(position, quat_multiply(quat_from_yaw(yaw), home[3:]))
+
+
+def bend_from(home: np.ndarray, pitch: float = 0, yaw: float = 0) -> np.ndarray:
+    """Pose of a head whose owner turns by `pitch` and `yaw` [rad] about the waist. Shape (7,)."""
+    heading = quat_from_yaw(compute_heading(home[3:]))
+    back = quat_from_yaw(-compute_heading(home[3:]))
+    turn = quat_multiply(quat_multiply(heading, quat_from_rpy(0, pitch, yaw)), back)
+    waist = quat_rotate(heading, WAIST)
+    position = home[:3] + waist - quat_rotate(turn, waist)
+    return make_pose(position, quat_multiply(turn, home[3:]))
+
+
+def make_curve(home: np.ndarray) -> Callable[[float], np.ndarray]:
+    r"""A goal at 0.3 m/s whose heading is :math:`A(1 - \cos(2\pi t/T))`, after the lead-in.
+
+    A is such that the largest turn rate is `CURVE_TURN`; the head faces along the path.
+
+    Args:
+        home: Pose at the start. Shape (7,).
+
+    Returns:
+        The pose at a time [s]. Shape (7,).
+    """
+    omega = 2 * math.pi / CURVE_PERIOD
+    amplitude = CURVE_TURN / omega
+    dt = 0.001
+    times = np.arange(0, CURVE_S + 1, dt)
+    headings = amplitude * (1 - np.cos(omega * times))
+    steps = CURVE_SPEED * dt * np.stack([np.cos(headings), np.sin(headings)], axis=1)
+    places = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])[:-1]
+
+    def path(time: float) -> np.ndarray:
+        since = min(max(0.0, time - LEAD_IN_S), CURVE_S)
+        place = [np.interp(since, times, places[:, i]) for i in range(2)]
+        heading = amplitude * (1 - math.cos(omega * since))
+        return move_from(home, (float(place[0]), float(place[1]), 0.0), heading)
+
+    return path
 
 
 def _sway(home: np.ndarray, time: float) -> np.ndarray:

@@ -44,7 +44,7 @@ class LowLevelPolicy(ABC):
     memory_size: int
     arm_limits: Mapping[str, tuple[float, float]] = {}
     """Angles within which arm targets are kept, by joint, where the robot does not stand or walk
-    safely beyond [rad]; `scripts/benchmark_policies.py` tells."""
+    safely beyond [rad]; `benchmarks/run_policies.py` tells."""
 
     ranges: Mapping[Mode, Mapping[str, tuple[float, float]]] = {}
     """Commands that it can do in each mode, by entry, where that is less than the robot's."""

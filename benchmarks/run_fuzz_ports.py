@@ -1,6 +1,6 @@
 """Send garbage to every port that is open, and print what it has done.
 
-    python scripts/fuzz_ports.py --bytes 10000000
+    python -m benchmarks.run_fuzz_ports --bytes 10000000
 
 Everything stays on this machine. The process that is attacked is one of its own, so that a crash
 and the growth of its memory show; an operator, or a client, that behaves well goes on beside.

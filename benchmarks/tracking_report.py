@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.tracking_scenarios import SCENARIOS, Scenario
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.evaluation.bench_report import describe_machine, make_table
-from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, Scenario
 
 Run = Mapping[str, Any]
 

@@ -6,7 +6,7 @@ model, low-level policy with the plant's memory) is started from the state each 
 the true one; printed is by how much the predicted displacements of the base differ after 60 and
 200 ms, and how far the states themselves are from the truth.
 
-    python scripts/benchmark_sync.py --seeds 5 --duration 12 --noise mild
+    python -m benchmarks.run_sync --seeds 5 --duration 12 --noise mild
 """
 
 from __future__ import annotations

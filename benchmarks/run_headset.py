@@ -1,7 +1,7 @@
 """Measure how old a headset's frame is when it is read, and when its command is there.
 
-    python scripts/benchmark_headset.py --seconds 30
-    python scripts/benchmark_headset.py --sender browser --retargeter mpc
+    python -m benchmarks.run_headset --seconds 30
+    python -m benchmarks.run_headset --sender browser --retargeter mpc
 
 A sender in a process of its own sends frames over loopback, with the stamps of the clock that all
 processes of a machine share, engages by the gesture and drives a simulated robot in real time. It

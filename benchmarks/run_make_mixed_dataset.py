@@ -1,6 +1,6 @@
 """Make a small dataset of mixed episodes and two killed sessions, to try `xop-curate` on.
 
-    .venv/bin/python scripts/make_mixed_dataset.py --out outputs/mixed
+    .venv/bin/python -m benchmarks.run_make_mixed_dataset --out outputs/mixed
 
 A G1 in simulation follows a made-up person who crouches and stands up again: some do it well, some
 not deeply enough, some robots are pushed over, some headsets lose track, some people stand about

@@ -1,6 +1,6 @@
 r"""Print how near a policy's hands come to their points, beside others' in the same episodes.
 
-    python scripts/evaluate_policy.py --at 6 --rollouts trained=outputs/rollout_trained \
+    python -m benchmarks.run_evaluate_policy --at 6 --rollouts trained=outputs/rollout_trained \
         untrained=outputs/rollout_untrained
 
 Each of --rollouts is a dataset that `lerobot-rollout` recorded with a robot of this project, in a
@@ -25,7 +25,7 @@ from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import BadValue, XopError
 
 if TYPE_CHECKING:
-    from xop_lerobot.evaluation.policy_error import Hands
+    from benchmarks.policy_error import Hands
 
 STILL, BLIND = "stand still", "best without looking"
 
@@ -36,7 +36,7 @@ def read_rollouts(texts: list[str], at: float) -> dict[str, Hands]:
     Raises:
         BadValue: If one is not of that form, or they are not of the same episodes.
     """
-    from xop_lerobot.evaluation.policy_error import read_hands
+    from benchmarks.policy_error import read_hands
 
     found: dict[str, Hands] = {}
     for text in texts:
@@ -57,12 +57,12 @@ def read_rollouts(texts: list[str], at: float) -> dict[str, Hands]:
 
 def evaluate(rollouts: dict[str, Hands], at: float) -> dict[str, Any]:
     """Compute what is printed, fit for JSON."""
-    from xop_lerobot.evaluation.intervals import compute_mean_interval
-    from xop_lerobot.evaluation.policy_error import (
+    from benchmarks.policy_error import (
         compute_best_blind_error,
         compute_margin,
         stand_still,
     )
+    from xop_lerobot.evaluation.intervals import compute_mean_interval
 
     first = next(iter(rollouts))
     setting, episodes = rollouts[first].setting, rollouts[first].episodes

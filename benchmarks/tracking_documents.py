@@ -7,22 +7,22 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.core.errors import BadValue, XopError
-from xop_lerobot.evaluation.bench_report import describe_versions, make_bench_blocks
-from xop_lerobot.evaluation.tracking_plot import plot_variants
-from xop_lerobot.evaluation.tracking_report import (
+from benchmarks.tracking_plot import plot_variants
+from benchmarks.tracking_report import (
     Run,
     fill_document,
     make_ablation_table,
     make_scenario_table,
     read_runs,
 )
-from xop_lerobot.evaluation.tracking_scenarios import SCENARIO_GROUPS
-from xop_lerobot.evaluation.tracking_setup import (
+from benchmarks.tracking_scenarios import SCENARIO_GROUPS
+from benchmarks.tracking_setup import (
     ABLATIONS,
     SYNC_VARIANTS,
     TrackingSetup,
 )
+from xop_lerobot.core.errors import BadValue, XopError
+from xop_lerobot.evaluation.bench_report import describe_versions, make_bench_blocks
 
 DOCUMENT = Path("docs/benchmarks.md")
 ROBOTS = ("g1", "rby1")
@@ -56,7 +56,7 @@ def write_documents(root: Path, results: Path, benches: Sequence[Path] = ()) -> 
 
     Args:
         root: The repository.
-        results: JSON file of scripts/benchmark_tracking.py.
+        results: JSON file of benchmarks/run_tracking.py.
         benches: JSON files of xop-bench, in the order of the table.
 
     Returns:

@@ -1,6 +1,6 @@
 """Print the planner's own time per solve beside that of pytorch_mppi's KMPPI.
 
-    python scripts/benchmark_planner.py --repeats 500
+    python -m benchmarks.run_planner --repeats 500
 
 Medians of interleaved solves on one thread, without physics and policy. Needs the extra `dev`.
 """
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import argparse
 
+from benchmarks.planner import make_planner_table, measure_planners
 from xop_lerobot.core.command_line import make_output_readable
-from xop_lerobot.evaluation.planner import make_planner_table, measure_planners
 
 
 def main() -> None:

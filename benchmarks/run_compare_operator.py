@@ -1,6 +1,6 @@
 """Print how fast and how smoothly a person moves: recorded ones beside the simulated one.
 
-    python scripts/compare_operator.py recording.npz ... --seeds 4 --plot comparison.png
+    python -m benchmarks.run_compare_operator recording.npz ... --seeds 4 --plot comparison.png
 
 The recordings are of real people, in the format of docs/operator.md; the simulated person touches
 two points with a robot without physics that follows within 0.3 s. Recordings of walking hold no
@@ -14,15 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from xop_lerobot.core.command_line import make_output_readable
-from xop_lerobot.core.errors import XopError
-from xop_lerobot.operator.simulated.comparison import (
+from benchmarks.person_comparison import (
     Motion,
     compute_figures,
     compute_spectrum,
     load_motion,
     simulate_motion,
 )
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import XopError
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Count the gestures that nobody made: in recordings, and in hours of simulated work.
 
-    python scripts/measure_gestures.py recording.npz outputs/dataset --hours 1 --seed 0
+    python -m benchmarks.run_measure_gestures recording.npz outputs/dataset --hours 1 --seed 0
 
 Motion comes from recordings (`.npz`, or the episodes of a dataset), again and again, and from a
 simulated person who stands, walks, turns and reaches. Hands close and open by chance, for 0.1 to
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.person_comparison import simulate_frames
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import XopError
 from xop_lerobot.core.transforms import make_pose
@@ -28,7 +29,6 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import GestureConfig
 from xop_lerobot.operator.hands import Hands
 from xop_lerobot.operator.recording import Recording, load_recording
-from xop_lerobot.operator.simulated.comparison import simulate_frames
 
 RATE = 50
 """Rate of the streams [Hz]."""

@@ -15,31 +15,25 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import (
     make_pose,
-    quat_from_rpy,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
 )
+from xop_lerobot.evaluation.bench import (
+    CURVE_S,
+    LEAD_IN_S,
+    bend_from,
+    make_curve,
+    move_from,
+)
 from xop_lerobot.operator.interpolation import compute_heading
 
-LEAD_IN_S = 1.0
-"""Time for which the first goal is the pose at home [s]."""
 WALK_SPEED = 0.5
 """Speed of the direct path that arrival times are compared with [m/s]."""
 ARRIVAL_S = 3.0
 """Time that a mobile robot may take longer than the direct path [s]."""
 STATIONARY_S = 1.5
 """Time in which a stationary robot shall arrive [s]."""
-CURVE_SPEED = 0.3
-"""Speed of the moving goal [m/s]."""
-CURVE_TURN = 0.3
-"""Largest turn rate of the moving goal [rad/s]: a radius of 1 m."""
-CURVE_PERIOD = 16.0
-"""Time in which the moving goal turns left and right once [s]."""
-CURVE_S = 20.0
-"""Length of the moving goal's path [s]."""
-WAIST = np.array([-0.05, 0.0, -0.42])
-"""Where a person's waist is from the head, in the heading frame [m]: bends turn about it."""
 ROOM_HALF = 4.0
 """Half the width of the scene `room`, between the walls' faces [m]."""
 WALL_DISTANCE = 0.25
@@ -146,23 +140,6 @@ MOBILE_TOLERANCE = {
 }
 
 
-def move_from(home: np.ndarray, offset: tuple[float, float, float], yaw: float = 0) -> np.ndarray:
-    """Pose that is `offset` [m] and `yaw` [rad] away from home, in its heading frame. (7,)."""
-    heading = quat_from_yaw(compute_heading(home[3:]))
-    position = home[:3] + quat_rotate(heading, np.array(offset))
-    return make_pose(position, quat_multiply(quat_from_yaw(yaw), home[3:]))
-
-
-def bend_from(home: np.ndarray, pitch: float = 0, yaw: float = 0) -> np.ndarray:
-    """Pose of a head whose owner turns by `pitch` and `yaw` [rad] about the waist. Shape (7,)."""
-    heading = quat_from_yaw(compute_heading(home[3:]))
-    back = quat_from_yaw(-compute_heading(home[3:]))
-    turn = quat_multiply(quat_multiply(heading, quat_from_rpy(0, pitch, yaw)), back)
-    waist = quat_rotate(heading, WAIST)
-    position = home[:3] + waist - quat_rotate(turn, waist)
-    return make_pose(position, quat_multiply(turn, home[3:]))
-
-
 def _hold_each(home: np.ndarray, heads: tuple[np.ndarray, ...], hold: float) -> GoalTrack:
     """Stationary goals one after the other, `hold` [s] in all, at least 3 s each."""
     each = max(3.0, hold / len(heads))
@@ -198,34 +175,6 @@ def _pitch(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: i
     del rng, num_goals
     heads = (bend_from(home, pitch=0.2), bend_from(home, pitch=-0.2), home)
     return _hold_each(home, heads, hold)
-
-
-def make_curve(home: np.ndarray) -> Callable[[float], np.ndarray]:
-    r"""A goal at 0.3 m/s whose heading is :math:`A(1 - \cos(2\pi t/T))`, after the lead-in.
-
-    A is such that the largest turn rate is `CURVE_TURN`; the head faces along the path.
-
-    Args:
-        home: Pose at the start. Shape (7,).
-
-    Returns:
-        The pose at a time [s]. Shape (7,).
-    """
-    omega = 2 * math.pi / CURVE_PERIOD
-    amplitude = CURVE_TURN / omega
-    dt = 0.001
-    times = np.arange(0, CURVE_S + 1, dt)
-    headings = amplitude * (1 - np.cos(omega * times))
-    steps = CURVE_SPEED * dt * np.stack([np.cos(headings), np.sin(headings)], axis=1)
-    places = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])[:-1]
-
-    def path(time: float) -> np.ndarray:
-        since = min(max(0.0, time - LEAD_IN_S), CURVE_S)
-        place = [np.interp(since, times, places[:, i]) for i in range(2)]
-        heading = amplitude * (1 - math.cos(omega * since))
-        return move_from(home, (float(place[0]), float(place[1]), 0.0), heading)
-
-    return path
 
 
 def _curve(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:

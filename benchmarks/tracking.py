@@ -16,6 +16,20 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from benchmarks.tracking_metrics import (
+    Trajectory,
+    compute_errors,
+    compute_metrics,
+)
+from benchmarks.tracking_scenarios import SCENARIOS, GoalTrack, Scenario
+from benchmarks.tracking_setup import (
+    TrackingSetup,
+    compute_physics_steps,
+    get_ablation,
+    make_retargeter_config,
+    make_tuned_morphology,
+    resolve_configs,
+)
 from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import (
@@ -23,20 +37,6 @@ from xop_lerobot.core.transforms import (
     pose_inverse,
     pose_multiply,
     quat_from_yaw,
-)
-from xop_lerobot.evaluation.tracking_metrics import (
-    Trajectory,
-    compute_errors,
-    compute_metrics,
-)
-from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, GoalTrack, Scenario
-from xop_lerobot.evaluation.tracking_setup import (
-    TrackingSetup,
-    compute_physics_steps,
-    get_ablation,
-    make_retargeter_config,
-    make_tuned_morphology,
-    resolve_configs,
 )
 from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.factory import make_policy, resolve_policy

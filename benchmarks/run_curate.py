@@ -1,9 +1,9 @@
 """Print the time and the peak memory of `xop-curate` on synthetic datasets of growing size.
 
-    python scripts/benchmark_curate.py --episodes 10,100,1000 --frames 9000
+    python -m benchmarks.run_curate --episodes 10,100,1000 --frames 9000
 
 Episodes of 9,000 frames are six minutes at 25 Hz, so 1,000 of them are 100 hours. They are made by
-`xop_lerobot.dataset.curate.synthetic`, without pictures, and deleted again: 1,000 and what is kept
+`benchmarks.curate_synthetic`, without pictures, and deleted again: 1,000 and what is kept
 of them take about 6 GB of disk in --work. Each command is a process of its own on one thread;
 memory is its maximum resident set.
 """
@@ -33,7 +33,7 @@ COMMANDS = {
 
 def make(root: Path, episodes: int, frames: int, seed: int) -> None:
     """Make a dataset."""
-    from xop_lerobot.dataset.curate.synthetic import make_dataset
+    from benchmarks.curate_synthetic import make_dataset
 
     make_dataset(root, episodes, frames, seed=seed)
 

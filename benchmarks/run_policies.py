@@ -1,12 +1,12 @@
 """Compare G1's low-level policies, alone and under the model predictive controller.
 
-    python scripts/benchmark_policies.py --policies default falcon openwbt=FOLDER
-    python scripts/benchmark_policies.py --policies all=FOLDER --docs docs/low_level.md \
+    python -m benchmarks.run_policies --policies default falcon openwbt=FOLDER
+    python -m benchmarks.run_policies --policies all=FOLDER --docs docs/low_level.md \
         --json outputs/policies.json
 
 A policy is a name, the path of a table of your own, or either with its file or folder behind `=`.
 Parts: `speed` of one call; plain `commands` held for 10 s; `arms` held anywhere; random
-`sequences`; `mpc`, the scenarios of scripts/benchmark_tracking.py with the policy in the planner's
+`sequences`; `mpc`, the scenarios of benchmarks/run_tracking.py with the policy in the planner's
 rollouts. What a JSON file holds already is not run again. `--parts rest` prints how each policy's
 standing robot leans and moves its base unasked, as its table holds it.
 """
@@ -27,12 +27,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import mujoco
 import numpy as np
 
-from xop_lerobot.core.command import Mode
-from xop_lerobot.core.command_line import make_output_readable
-from xop_lerobot.core.errors import UnknownName, XopError
-from xop_lerobot.evaluation.tracking import run_trial
-from xop_lerobot.evaluation.tracking_setup import TrackingSetup
-from xop_lerobot.low_level.comparison import (
+from benchmarks.low_level_comparison import (
     ARMS,
     FAR,
     RESPONSES,
@@ -48,6 +43,11 @@ from xop_lerobot.low_level.comparison import (
     measure_speeds,
     replace_table,
 )
+from benchmarks.tracking import run_trial
+from benchmarks.tracking_setup import TrackingSetup
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import UnknownName, XopError
 from xop_lerobot.low_level.factory import list_policies, make_policy
 from xop_lerobot.low_level.policy import LowLevelPolicy
 from xop_lerobot.morphology.morphology import make_morphology

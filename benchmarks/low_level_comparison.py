@@ -11,13 +11,13 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from benchmarks.low_level_excitation import Excitation, ExcitationConfig, make_excitation
+from benchmarks.low_level_trial import BatchSimulation, TrialResult, run_trials
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.transforms import compute_projected_gravity, quat_yaw
-from xop_lerobot.low_level.excitation import Excitation, ExcitationConfig, make_excitation
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
-from xop_lerobot.low_level.trial import BatchSimulation, TrialResult, run_trials
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 

@@ -1,7 +1,7 @@
 """Run every verb of `xop-curate` on a mixed dataset, and print what each does to its source.
 
-    python scripts/make_mixed_dataset.py --out outputs/mixed
-    python scripts/check_mixed_dataset.py --root outputs/mixed
+    python -m benchmarks.run_make_mixed_dataset --out outputs/mixed
+    python -m benchmarks.run_check_mixed_dataset --root outputs/mixed
 
 Before and after each verb the SHA-256 of every file of the source is taken. A line tells the exit
 code, whether the source is the same byte by byte, and the last line that the verb printed. What the

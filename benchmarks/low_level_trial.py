@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from benchmarks.low_level_excitation import Excitation
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import compute_projected_gravity, quat_rotate, quat_yaw
-from xop_lerobot.low_level.excitation import Excitation
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 
 FALL_HEIGHT = 0.35

@@ -1,11 +1,11 @@
 """Measure in closed loop how well the robots track goals of the head.
 
-    python scripts/benchmark_tracking.py --robot g1 --scenarios squat,yaw --seeds 3 --jobs 1
-    python scripts/benchmark_tracking.py --robot rby1 --scenarios diagonal --plot diagonal.png
-    python scripts/benchmark_tracking.py --robot g1 --set mobile.horizon=20 --scenarios mobile
-    python scripts/benchmark_tracking.py --robot both --scenarios all --hold 60 --seeds 10 \
+    python -m benchmarks.run_tracking --robot g1 --scenarios squat,yaw --seeds 3 --jobs 1
+    python -m benchmarks.run_tracking --robot rby1 --scenarios diagonal --plot diagonal.png
+    python -m benchmarks.run_tracking --robot g1 --set mobile.horizon=20 --scenarios mobile
+    python -m benchmarks.run_tracking --robot both --scenarios all --hold 60 --seeds 10 \
         --ablations default,table1 --jobs 2 --json outputs/tracking.json
-    python scripts/benchmark_tracking.py --json outputs/tracking.json --write-docs
+    python -m benchmarks.run_tracking --json outputs/tracking.json --write-docs
 
 Errors are those of the true head. A key figure is printed per run, a table of median / worst over
 the seeds at the end. Runs that the JSON file holds already are not run again.
@@ -24,23 +24,23 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from xop_lerobot.core.command_line import make_output_readable
-from xop_lerobot.core.errors import UnknownName, XopError
-from xop_lerobot.evaluation.tracking import make_record, run_scenario, run_trial
-from xop_lerobot.evaluation.tracking_documents import write_documents
-from xop_lerobot.evaluation.tracking_report import (
+from benchmarks.tracking import make_record, run_scenario, run_trial
+from benchmarks.tracking_documents import write_documents
+from benchmarks.tracking_report import (
     Results,
     describe_run,
     make_ablation_table,
     make_scenario_table,
 )
-from xop_lerobot.evaluation.tracking_scenarios import SCENARIO_GROUPS, SCENARIOS
-from xop_lerobot.evaluation.tracking_setup import (
+from benchmarks.tracking_scenarios import SCENARIO_GROUPS, SCENARIOS
+from benchmarks.tracking_setup import (
     ABLATIONS,
     TrackingSetup,
     get_ablation,
     parse_overrides,
 )
+from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.errors import UnknownName, XopError
 from xop_lerobot.morphology.morphology import make_morphology
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -180,7 +180,7 @@ def print_tables(setups: list[TrackingSetup], runs: dict[str, dict[str, Any]]) -
 
 def plot_first(args: argparse.Namespace, setup: TrackingSetup) -> None:
     """Run one seed, print its figures and draw it."""
-    from xop_lerobot.evaluation.tracking_plot import plot_run
+    from benchmarks.tracking_plot import plot_run
 
     start = perf_counter()
     track, trajectory = run_scenario(setup, args.first_seed)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.tracking_metrics import Trajectory, compute_errors
+from benchmarks.tracking_report import Run, select
+from benchmarks.tracking_scenarios import SCENARIOS, GoalTrack
 from xop_lerobot.core.transforms import quat_to_rpy
-from xop_lerobot.evaluation.tracking_metrics import Trajectory, compute_errors
-from xop_lerobot.evaluation.tracking_report import Run, select
-from xop_lerobot.evaluation.tracking_scenarios import SCENARIOS, GoalTrack
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

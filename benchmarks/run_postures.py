@@ -1,7 +1,7 @@
 """Drive robots to random reachable goals of the head in simulation, and tell which they miss.
 
-    python scripts/check_postures.py --robot rby1 --goals 20
-    python scripts/check_postures.py --robot g1 --goals 10 --noise mild
+    python -m benchmarks.run_postures --robot rby1 --goals 20
+    python -m benchmarks.run_postures --robot g1 --goals 10 --noise mild
 
 Goals are made from postures that the robot can hold, so each can be reached; the robot goes from
 each to the next in stationary mode. The tests do the same with the kinematic proposal alone.
@@ -17,6 +17,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks.tracking import WorldAlignment
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import (
     compute_heading,
@@ -26,7 +27,6 @@ from xop_lerobot.core.transforms import (
     quat_from_yaw,
     rotation_error,
 )
-from xop_lerobot.evaluation.tracking import WorldAlignment
 from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology

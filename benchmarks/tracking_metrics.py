@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from benchmarks.tracking_scenarios import GoalStep, GoalTrack, Tolerance
 from xop_lerobot.core.errors import BadShape
 from xop_lerobot.core.transforms import rotation_error
-from xop_lerobot.evaluation.tracking_scenarios import GoalStep, GoalTrack, Tolerance
 
 WINDOW_S = 1.0
 """Window of the mean errors [s]."""
