@@ -3,7 +3,7 @@
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
-SOURCES := xop_lerobot robots teleoperators scripts tests
+SOURCES := xop_lerobot robots teleoperators benchmarks scripts tests typings
 # A worker for each core, up to four; a file's tests stay together, and share what they set up.
 PARALLEL := --numprocesses logical --maxprocesses 4 --dist loadfile
 
@@ -14,7 +14,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test format lint type check lock clean
+.PHONY: help setup demo test fast format lint type check lock clean
 
 help:  ## Show the verbs
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' Makefile
@@ -30,15 +30,21 @@ test: setup  ## Lint, then run the tests on all cores; what they skipped and why
 	@$(PYTHON) -m ruff check --quiet $(SOURCES)
 	@$(PYTHON) -m pytest -q $(PARALLEL)
 
+fast: setup  ## Lint, then run the tests but for the slow ones
+	@$(PYTHON) scripts/setup.py --test-tools
+	@$(PYTHON) -m ruff check --quiet $(SOURCES)
+	@$(PYTHON) -m pytest -q $(PARALLEL) -m "not slow"
+
 format: setup  ## Format the code and apply the linter's safe fixes
 	@$(PYTHON) -m ruff format $(SOURCES)
 	@$(PYTHON) -m ruff check --fix $(SOURCES)
 
-lint: setup  ## Check lint and format, change nothing
+lint: setup  ## Check lint, format and import rules, change nothing
 	@$(PYTHON) -m ruff check $(SOURCES)
 	@$(PYTHON) -m ruff format --check $(SOURCES)
+	@$(VENV)/bin/lint-imports
 
-type: setup  ## Check the types (pyright fetches Node.js the first time)
+type: setup  ## Check the types
 	@$(PYTHON) -m pyright
 
 check: lint type test  ## Everything that a change must pass
