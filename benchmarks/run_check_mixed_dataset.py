@@ -49,7 +49,7 @@ def compute_digest(root: Path) -> str:
 
 def run_verb(words: list[str]) -> tuple[int, str]:
     """Run a verb; returns its exit code and the last line that it printed."""
-    from xop_lerobot.dataset.curate.cli import main as curate
+    from xop_lerobot.curate.cli import main as curate
 
     output, errors = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):

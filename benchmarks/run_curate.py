@@ -43,7 +43,7 @@ def measure(command: list[str]) -> dict[str, Any]:
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     start = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, "-m", "xop_lerobot.dataset.curate.cli", *command],
+        [sys.executable, "-m", "xop_lerobot.curate.cli", *command],
         stdout=subprocess.PIPE,
         env=environment,
         text=True,

@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     import mujoco
 
     from lerobot_robot_xop.xop_robot import XopRobot
-    from xop_lerobot.dataset.xop_dataset import XopDataset
     from xop_lerobot.operator.view import SeenObject
     from xop_lerobot.plant.simulation import Simulation
+    from xop_lerobot.recording.dataset import XopDataset
 
 FPS = 25
 RATE_HZ = 50
@@ -196,9 +196,9 @@ class Recorder:
 
         from lerobot_robot_xop.config_xop import XopG1Config
         from lerobot_robot_xop.xop_robot import XopG1
-        from xop_lerobot.dataset.record import build_features
-        from xop_lerobot.dataset.xop_dataset import XopDataset
         from xop_lerobot.link import get_session
+        from xop_lerobot.recording.dataset import XopDataset
+        from xop_lerobot.recording.record import build_features
 
         self._seed, self._session = seed, get_session(SESSION)
         self.robot: XopRobot = XopG1(
@@ -236,7 +236,7 @@ class Recorder:
 
     def record(self, index: int, name: str, ticks: int | None = None) -> None:
         """Record episode `index` of the kind `name`, or its first `ticks` without saving it."""
-        from xop_lerobot.dataset.tick import run_tick
+        from xop_lerobot.recording.tick import run_tick
 
         rng = np.random.default_rng([self._seed, index])
         Crouch.push = KINDS[name].push
@@ -290,7 +290,7 @@ def make_killed_stock(source: Path, root: Path) -> None:
     from lerobot.datasets import LeRobotDataset
     from lerobot.utils.constants import DEFAULT_FEATURES
 
-    from xop_lerobot.dataset.columns import is_own_column
+    from xop_lerobot.recording.columns import is_own_column
 
     frames = LeRobotDataset(f"local/{source.name}", root=source)
     features = {

@@ -15,8 +15,8 @@ from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 from toy_robot import make_teleop, make_toy
 
-from xop_lerobot.dataset.record import build_features
-from xop_lerobot.dataset.xop_dataset import XopDataset
+from xop_lerobot.recording.dataset import XopDataset
+from xop_lerobot.recording.record import build_features
 
 FPS = 20
 CAMERA = "observation.images.top"

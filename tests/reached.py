@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.dataset.collect_config import CollectConfig
-from xop_lerobot.dataset.collect_folder import DATASET
-from xop_lerobot.dataset.collect_worker import Collector
+from xop_lerobot.collect.config import CollectConfig
+from xop_lerobot.collect.folder import DATASET
+from xop_lerobot.collect.worker import Collector
 
 
 def collect_reach(folder: Path, **settings: Any) -> Path:

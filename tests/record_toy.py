@@ -13,7 +13,7 @@ import toy_robot  # noqa: E402, F401
 def main() -> None:
     command = sys.argv.pop(1)
     if command == "xop-record":
-        from xop_lerobot.dataset.record import main as run
+        from xop_lerobot.recording.record import main as run
     else:
         from lerobot.scripts.lerobot_record import main as run
     run()

@@ -20,16 +20,16 @@ import pandas as pd
 import pytest
 from lerobot.datasets import LeRobotDataset
 
-import xop_lerobot.dataset.collect_folder as folder_module
+import xop_lerobot.collect.folder as folder_module
+from xop_lerobot.collect.cli import collect, main, make_parser, parse_arguments
+from xop_lerobot.collect.config import CollectConfig
+from xop_lerobot.collect.folder import CollectFolder, FolderTaken, OtherSettings
+from xop_lerobot.collect.jobs import WorkerFailed
+from xop_lerobot.collect.merge import merge_attempts
+from xop_lerobot.collect.worker import Collector
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
-from xop_lerobot.dataset.collect import collect, main, make_parser, parse_arguments
-from xop_lerobot.dataset.collect_config import CollectConfig
-from xop_lerobot.dataset.collect_folder import CollectFolder, FolderTaken, OtherSettings
-from xop_lerobot.dataset.collect_jobs import WorkerFailed
-from xop_lerobot.dataset.collect_merge import merge_attempts
-from xop_lerobot.dataset.collect_worker import Collector
-from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.operator.devices import DeviceConfig, make_device
+from xop_lerobot.recording.facts import read_facts
 
 REPO = Path(__file__).parents[1]
 CONFIG = CollectConfig(
@@ -138,7 +138,7 @@ def test_format_is_that_of_a_recorded_dataset(serial, tmp_path):
         "dataset.push_to_hub": "false", "dataset.no_stamp": "true", "play_sounds": "false",
     }  # fmt: skip
     code = (
-        "import collect_toy, sys; from xop_lerobot.dataset.record import main;"
+        "import collect_toy, sys; from xop_lerobot.recording.record import main;"
         "sys.argv[0] = 'xop-record'; main()"
     )
     arguments = [f"--{name}={value}" for name, value in flags.items()]
@@ -259,7 +259,7 @@ def test_kill_and_go_on(serial, orders, tmp_path, monkeypatch):
     """Killed with episodes finished and under way: none is lost, and none is made twice."""
     root = tmp_path / "data"
     work = CollectFolder(root).work / "attempts"
-    command = [sys.executable, "-m", "xop_lerobot.dataset.collect", *FLAGS, f"--root={root}"]
+    command = [sys.executable, "-m", "xop_lerobot.collect.cli", *FLAGS, f"--root={root}"]
     process = subprocess.Popen([*command, "--episodes=5", "--workers=2"], stderr=subprocess.DEVNULL)
     wait_for(lambda: len(list(work.glob("[0-9]*/attempt.json"))) >= 2)
     (orders / "wait-1").touch()
@@ -556,7 +556,7 @@ def test_a_full_disk_ends_in_a_line(tmp_path, capsys, monkeypatch):
     def is_full(*_: object) -> None:
         raise OSError(28, "No space left on device", "data/file-000.parquet")
 
-    monkeypatch.setattr("xop_lerobot.dataset.collect.collect", is_full)
+    monkeypatch.setattr("xop_lerobot.collect.cli.collect", is_full)
     flags = ["--robot=g1", "--task=dual_point_touch", "--episodes=1", f"--root={tmp_path}/a"]
     assert main(flags) == 1
     assert capsys.readouterr().err == (

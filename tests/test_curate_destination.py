@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from xop_lerobot.collect.folder import FolderTaken
 from xop_lerobot.core.errors import XopError
-from xop_lerobot.dataset.collect_folder import FolderTaken
-from xop_lerobot.dataset.curate import destination as module
-from xop_lerobot.dataset.curate.destination import Destination
+from xop_lerobot.curate import destination as module
+from xop_lerobot.curate.destination import Destination
 
 REPO = Path(__file__).parents[1]
 
@@ -106,7 +106,7 @@ def test_two_renames_that_were_cut_are_put_right(source, tmp_path, monkeypatch):
 def test_killed_run_leaves_the_source_and_the_next_one_cleans_up(source, tmp_path):
     code = (
         "import os, signal, sys; from pathlib import Path;"
-        "from xop_lerobot.dataset.curate.destination import Destination;"
+        "from xop_lerobot.curate.destination import Destination;"
         f"draft = Destination(None, Path({str(source)!r})).__enter__();"
         "draft.mkdir(); (draft / 'content').write_text('half');"
         "os.kill(os.getpid(), signal.SIGKILL)"

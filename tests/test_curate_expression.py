@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
-from xop_lerobot.dataset.curate.expression import Expression, Kind
+from xop_lerobot.curate.expression import Expression, Kind
 
 KINDS = {
     "success": Kind.FLAG,

@@ -17,13 +17,13 @@ from curate_data import compute_digests, make_foreign, make_synthetic, rewrite
 from lerobot.datasets import LeRobotDataset
 
 from xop_lerobot.core.errors import BadDataset
-from xop_lerobot.dataset.columns import HEALTH_NAMES
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.curate.expression import Expression
-from xop_lerobot.dataset.curate.figures import FIGURES
-from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.dataset.curate.survey import survey
-from xop_lerobot.dataset.facts import EPISODES_FILE, read_facts
+from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.expression import Expression
+from xop_lerobot.curate.figures import FIGURES
+from xop_lerobot.curate.source import Source
+from xop_lerobot.curate.survey import survey
+from xop_lerobot.recording.columns import HEALTH_NAMES
+from xop_lerobot.recording.facts import EPISODES_FILE, read_facts
 
 REPO = Path(__file__).parents[1]
 EPISODES = 6
@@ -277,7 +277,7 @@ def test_unknown_figure_is_refused(made, capsys):
 
 
 def test_reader_that_has_seen_enough(made):
-    command = f"{sys.executable} -m xop_lerobot.dataset.curate.cli inspect --root {made} | head -1"
+    command = f"{sys.executable} -m xop_lerobot.curate.cli inspect --root {made} | head -1"
     done = subprocess.run(command, shell=True, cwd=REPO, capture_output=True, text=True)
     assert done.stdout.split()[0] == "ep"
     assert "Traceback" not in done.stderr
@@ -288,7 +288,7 @@ def test_reader_that_has_seen_enough(made):
 
 def test_help_lists_verbs_and_loads_nothing_heavy():
     code = (
-        "import sys; from xop_lerobot.dataset.curate.cli import main\n"
+        "import sys; from xop_lerobot.curate.cli import main\n"
         "try: main(['--help'])\nexcept SystemExit as end: assert end.code == 0\n"
         "heavy = {'torch', 'mujoco', 'lerobot', 'scipy.signal'} & set(sys.modules)\n"
         "sys.exit(f'heavy: {heavy}' if heavy else 0)"
@@ -464,7 +464,7 @@ def test_memory_does_not_grow_with_the_dataset(tmp_path):
         root = make_synthetic(tmp_path / str(count), count, 2000)
         code = (
             "import resource, pyarrow, contextlib, io\n"
-            "from xop_lerobot.dataset.curate.cli import main\n"
+            "from xop_lerobot.curate.cli import main\n"
             f"with contextlib.redirect_stdout(io.StringIO()):\n"
             f"    assert main(['inspect', '--root', {str(root)!r}]) == 0\n"
             "print(next(l for l in open('/proc/self/status') if l.startswith('VmHWM')).split()[1])"
@@ -511,8 +511,8 @@ def test_kill_leaves_the_source_and_the_next_run_goes_through(data):
     flags = ["filter", "--root", str(data), "--where", where, "--in-place"]
     code = (
         "import os, signal\n"
-        "from xop_lerobot.dataset.curate.cli import main\n"
-        "from xop_lerobot.dataset.curate.expression import Expression\n"
+        "from xop_lerobot.curate.cli import main\n"
+        "from xop_lerobot.curate.expression import Expression\n"
         "stock = Expression.evaluate\n"
         "def evaluate(self, values):\n"
         "    if values['episode'] == 4: os.kill(os.getpid(), signal.SIGKILL)\n"

@@ -12,11 +12,11 @@ from curate_data import compute_digests, make_foreign, make_synthetic
 from curate_recorded import load, read_rows, record_toy
 
 from xop_lerobot.core.errors import BadValue, UnknownName
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.curate.frame_rules import FrameRules, list_entries
-from xop_lerobot.dataset.curate.label_session import LabelSession
-from xop_lerobot.dataset.curate.label_views import LabelWindow, ask_in_terminal, read_films
-from xop_lerobot.dataset.curate.labels import (
+from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.frame_rules import FrameRules, list_entries
+from xop_lerobot.curate.label_session import LabelSession
+from xop_lerobot.curate.label_views import LabelWindow, ask_in_terminal, read_films
+from xop_lerobot.curate.labels import (
     Label,
     list_runs,
     number_frames,
@@ -24,8 +24,8 @@ from xop_lerobot.dataset.curate.labels import (
     set_success,
     write_labels,
 )
-from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.curate.source import Source
+from xop_lerobot.recording.facts import read_facts
 
 EPISODES, FRAMES, FPS = 4, 60, 25
 

@@ -15,9 +15,9 @@ from curate_recorded import load, read_metadata, read_pictures, read_rows, recor
 from huggingface_hub.utils import filter_repo_objects
 from lerobot.datasets import lerobot_dataset
 
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.source import Source
+from xop_lerobot.recording.facts import read_facts
 
 LENGTHS = (16, 12, 14)
 HEAD = "observation.images.head"
@@ -34,7 +34,7 @@ def curated(recorded) -> Path:
     labelled, out = (recorded.with_name(name) for name in ("labelled", "curated"))
     words = ["--success", "episode < 2", "--subtask", "early=time < 0.3"]
     assert main(["label", "--root", str(recorded), "--out", str(labelled), *words]) == 0
-    from xop_lerobot.dataset.curate.transfer import Clip, Step, transfer
+    from xop_lerobot.curate.transfer import Clip, Step, transfer
 
     with Source(labelled) as source:
         clips = [Clip(source, entry, (3, entry.length)) for entry in source.episodes]

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from curate_data import CAMERA, EVERY, compute_digests, make_numbered, read_numbers, rewrite
 
-from xop_lerobot.dataset.curate.cli import main
+from xop_lerobot.curate.cli import main
 
 LENGTHS = (14, 10, 10, 12)
 STARTS = (0, 14, 24, 34)

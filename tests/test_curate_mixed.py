@@ -17,8 +17,8 @@ import pytest
 from curate_data import compute_digests
 from curate_recorded import load, read_pictures, read_rows
 
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.curate.cli import main
+from xop_lerobot.recording.facts import read_facts
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from xop_lerobot.core.errors import BadShape
 from xop_lerobot.core.transforms import pose_multiply, quat_exp
-from xop_lerobot.dataset import quality
+from xop_lerobot.curate import quality
 
 DT = 0.04
 

@@ -18,9 +18,9 @@ from curate_recorded import CAMERA, FPS, load, make_packed, read_metadata, read_
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.curate.salvage import CannotSalvage, salvage
-from xop_lerobot.dataset.curate.thrift import (
+from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.salvage import CannotSalvage, salvage
+from xop_lerobot.curate.thrift import (
     BINARY,
     DOUBLE,
     I32,
@@ -33,7 +33,7 @@ from xop_lerobot.dataset.curate.thrift import (
     Reader,
     write_struct,
 )
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.recording.facts import read_facts
 
 TESTS = Path(__file__).parent
 LENGTHS = (37, 25, 44)

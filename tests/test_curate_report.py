@@ -16,14 +16,14 @@ from browser import open_page
 from curate_data import compute_digests, make_foreign, make_synthetic, rewrite
 
 from xop_lerobot.core.page import dump_script
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.curate.figures import FIGURES
-from xop_lerobot.dataset.curate.report_episode import Limits
-from xop_lerobot.dataset.curate.report_page import Report
-from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.dataset.curate.survey import survey
-from xop_lerobot.dataset.curate.traces import decode, encode, thin
-from xop_lerobot.dataset.facts import EPISODES_FILE
+from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.figures import FIGURES
+from xop_lerobot.curate.report_episode import Limits
+from xop_lerobot.curate.report_page import Report
+from xop_lerobot.curate.source import Source
+from xop_lerobot.curate.survey import survey
+from xop_lerobot.curate.traces import decode, encode, thin
+from xop_lerobot.recording.facts import EPISODES_FILE
 
 EPISODES, FRAMES = 6, 100
 EVIL = "</script><img src=x onerror=\"document.title='evil'\">"

@@ -18,23 +18,23 @@ import pytest
 import toy_robot  # noqa: F401  registers the robot
 from hardware_like import make_hardware_like
 
-import xop_lerobot.dataset.collect_run as run_module
+import xop_lerobot.collect.run as run_module
+from xop_lerobot.collect.merge import merge_attempts
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.state import FRAMES
-from xop_lerobot.dataset.collect_merge import merge_attempts
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.curate.retarget import RetargetFolder
-from xop_lerobot.dataset.curate.retarget_config import (
+from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.retarget import RetargetFolder
+from xop_lerobot.curate.retarget_config import (
     RetargetConfig,
     choose_fps,
     read_settings,
     read_weights,
 )
-from xop_lerobot.dataset.curate.retarget_source import RetargetJob, parse_episodes
-from xop_lerobot.dataset.curate.retarget_worker import Retargeter
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.curate.retarget_job import RetargetJob, parse_episodes
+from xop_lerobot.curate.retarget_worker import Retargeter
 from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.recording import Recording, load_recording, make_recording
+from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.retarget.config import RetargeterConfig
 
 REPO = Path(__file__).parents[1]

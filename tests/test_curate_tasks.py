@@ -14,8 +14,8 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_rows import get_episodes, get_row
 
 from xop_lerobot.core.errors import BadDataset
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.curate.task_words import TASKS_FILE, has_index_of_words, read_tasks
+from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.task_words import TASKS_FILE, has_index_of_words, read_tasks
 
 WORDS = ["task 0", "task 1"]
 NUMBERS = pa.array([0, 1])
@@ -102,9 +102,9 @@ def test_operator_with_several_tasks_is_retargeted_with_their_words(tmp_path):
     """The words of a row are asked for only where an episode has more than one."""
     from curate_data import rewrite
 
-    from xop_lerobot.dataset.curate.clip import Step
-    from xop_lerobot.dataset.curate.retarget_source import Operators
-    from xop_lerobot.dataset.curate.source import Source
+    from xop_lerobot.curate.clip import Step
+    from xop_lerobot.curate.retarget_job import Operators
+    from xop_lerobot.curate.source import Source
 
     root = make_synthetic(tmp_path / "data", 1, 40)
     pq.write_table(TABLES["a column"], root / TASKS_FILE)

@@ -28,13 +28,13 @@ from PIL import Image
 from toy_robot import make_teleop, make_toy
 
 from xop_lerobot.core.errors import BadDataset, BadShape, BadValue
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.curate.clip import Clip, Step, cut_changes
-from xop_lerobot.dataset.curate.pictures import VideoIndex
-from xop_lerobot.dataset.curate.source import Source
-from xop_lerobot.dataset.curate.transfer import NothingLeft, transfer
-from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.dataset.xop_dataset import XopDataset
+from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.clip import Clip, Step, cut_changes
+from xop_lerobot.curate.source import Source
+from xop_lerobot.curate.transfer import NothingLeft, transfer
+from xop_lerobot.curate.video import VideoIndex
+from xop_lerobot.recording.dataset import XopDataset
+from xop_lerobot.recording.facts import read_facts
 
 HEAD = "observation.images.head"
 COUNTED = ["timestamp", "frame_index", "episode_index", "index"]

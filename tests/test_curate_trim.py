@@ -11,8 +11,8 @@ import pytest
 from curate_data import compute_digests, make_foreign, rewrite
 from curate_recorded import load, read_pictures, read_rows, record_toy
 
-from xop_lerobot.dataset.curate.cli import main
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.curate.cli import main
+from xop_lerobot.recording.facts import read_facts
 
 HEAD = "observation.images.head"
 FILE = "data/chunk-000/file-{:03d}.parquet"

@@ -28,22 +28,22 @@ from toy_robot import get_state, make_teleop, make_toy, observe
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue, LinkError, XopError
+from xop_lerobot.core.shutdown import hold_signals
 from xop_lerobot.core.state import FRAMES, Goal
-from xop_lerobot.dataset import durability, embedding
-from xop_lerobot.dataset.columns import COST_NAMES, HEALTH_NAMES, Columns
-from xop_lerobot.dataset.executed import put_executed
-from xop_lerobot.dataset.facts import compute_config_hash, read_facts
-from xop_lerobot.dataset.record import build_features
-from xop_lerobot.dataset.shutdown import hold_signals
-from xop_lerobot.dataset.video_queue import MAX_IMAGES, VideoQueue
-from xop_lerobot.dataset.xop_dataset import (
+from xop_lerobot.link import Executed, Outcome, TickRecord, get_session
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.recording import durability, embedding
+from xop_lerobot.recording.columns import COST_NAMES, HEALTH_NAMES, Columns
+from xop_lerobot.recording.dataset import (
     BatchedEncoding,
     DatasetExists,
     WrongFps,
     XopDataset,
 )
-from xop_lerobot.link import Executed, Outcome, TickRecord, get_session
-from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.recording.executed import put_executed
+from xop_lerobot.recording.facts import compute_config_hash, read_facts
+from xop_lerobot.recording.record import build_features
+from xop_lerobot.recording.video_queue import MAX_IMAGES, VideoQueue
 
 REPO = Path(__file__).parents[1]
 POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]
@@ -239,7 +239,7 @@ def test_tables_are_what_lerobot_writes(session, pair, tmp_path, monkeypatch, us
     features = build_features(robot, use_videos=use_videos)
     tables = []
     for name, skip in (("ours", embedding.skip_embedding), ("stock", lambda _: nullcontext())):
-        monkeypatch.setattr("xop_lerobot.dataset.xop_dataset.skip_embedding", skip)
+        monkeypatch.setattr("xop_lerobot.recording.dataset.skip_embedding", skip)
         bound = XopDataset.bind(session)
         dataset = bound.create(
             "local/toy", 25, features, root=tmp_path / name, use_videos=use_videos
@@ -505,7 +505,7 @@ def test_a_dead_encoder_is_not_waited_for():
 def test_pictures_that_wait_for_the_disk_are_bounded(monkeypatch, alive):
     """Who adds a frame waits until the image files have caught up; dead workers never do."""
     waiting = list(range(MAX_IMAGES + 2))
-    monkeypatch.setattr("xop_lerobot.dataset.video_queue.time.sleep", lambda _: waiting.pop())
+    monkeypatch.setattr("xop_lerobot.recording.video_queue.time.sleep", lambda _: waiting.pop())
     queue = SimpleNamespace(qsize=lambda: len(waiting))
     worker = SimpleNamespace(is_alive=lambda: alive)
     images = SimpleNamespace(queue=queue, threads=[worker], processes=[])
@@ -730,7 +730,7 @@ def test_columns_of_another_version_are_not_mixed(session, pair, tmp_path, monke
     robot, teleop = pair
     root = tmp_path / "data"
     with monkeypatch.context() as patch:
-        patch.setattr("xop_lerobot.dataset.columns.HEALTH_NAMES", ("solve_time", "plan_age"))
+        patch.setattr("xop_lerobot.recording.columns.HEALTH_NAMES", ("solve_time", "plan_age"))
         dataset = create(session, robot, root)
         tick(robot, teleop, dataset)
         dataset.save_episode()

@@ -12,13 +12,13 @@ from lerobot.datasets import LeRobotDataset
 from test_lerobot_cli import ROBOT, record_flags, run
 
 from xop_lerobot.core.transforms import make_pose, quat_from_rpy
-from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.dataset.tally import Tally
-from xop_lerobot.dataset.wishes import grant
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.operator.display import Cue, Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.recording.facts import read_facts
+from xop_lerobot.recording.requests import grant
+from xop_lerobot.recording.tally import Tally
 
 POSTURES = {
     "rest": (quat_from_rpy(0, 0, 0), 1.1),

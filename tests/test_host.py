@@ -27,10 +27,10 @@ from test_dataset import STREAMING, tick
 from toy_robot import SMALL, XopToyConfig, make_teleop, make_toy
 
 from xop_lerobot.core.errors import BadValue, LinkError
-from xop_lerobot.dataset import host, rollout_loop
-from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.dataset.record import build_features
-from xop_lerobot.dataset.xop_dataset import DatasetExists, WrongFps, XopDataset
+from xop_lerobot.recording import host, rollout_loop
+from xop_lerobot.recording.dataset import DatasetExists, WrongFps, XopDataset
+from xop_lerobot.recording.facts import read_facts
+from xop_lerobot.recording.record import build_features
 
 STOCK_DATASET, STOCK_LOOP = LeRobotDataset, record_module.record_loop
 

@@ -25,10 +25,10 @@ from lerobot_rows import get_episodes, get_row
 from xop_lerobot.control.client import ControlClient
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue, XopError
-from xop_lerobot.dataset.facts import read_facts
-from xop_lerobot.dataset.record import XopRecordConfig
-from xop_lerobot.dataset.xop_dataset import XopDataset
 from xop_lerobot.link import get_session
+from xop_lerobot.recording.dataset import XopDataset
+from xop_lerobot.recording.facts import read_facts
+from xop_lerobot.recording.record import XopRecordConfig
 
 REPO = Path(__file__).parents[1]
 ROBOT = ("--robot.type=xop_toy", "--robot.width=64", "--robot.height=48")
@@ -42,7 +42,7 @@ TELEOP = (
 def run(monkeypatch, command: str, *flags: str) -> None:
     """Run `command` with `flags`, and leave no signal handler behind."""
     name = command.replace("-", "_")
-    module = "xop_lerobot.dataset.record" if name == "xop_record" else f"lerobot.scripts.{name}"
+    module = "xop_lerobot.recording.record" if name == "xop_record" else f"lerobot.scripts.{name}"
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     monkeypatch.setattr(sys, "argv", [command, *flags])
     try:

@@ -7,7 +7,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from test_lerobot_cli import ROBOT, TELEOP, record_flags, run
 
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.tasks import dual_point_touch
 
 

@@ -15,9 +15,9 @@ import pytest
 from curate_data import make_synthetic, rewrite
 
 from xop_lerobot.core.command_line import can_print_anything, make_output_readable
-from xop_lerobot.dataset.curate import cli as curate
-from xop_lerobot.dataset.curate.task_words import TASKS_FILE
-from xop_lerobot.dataset.curate.verbs import VERBS
+from xop_lerobot.curate import cli as curate
+from xop_lerobot.curate.task_words import TASKS_FILE
+from xop_lerobot.curate.verbs import VERBS
 
 WORDS = "Tür öffnen … 手"
 SPELT = r"Tur offnen ... \u624b"
@@ -139,8 +139,8 @@ def test_verbs_of_curate(root, monkeypatch, verb):
 
 def test_other_commands(monkeypatch):
     terminal = Terminal(monkeypatch, "ascii")
+    from xop_lerobot.collect import cli as collect
     from xop_lerobot.control import client
-    from xop_lerobot.dataset import collect
     from xop_lerobot.doctor import cli as doctor
     from xop_lerobot.doctor.finding import Finding, Level
     from xop_lerobot.evaluation import bench, eval_cli

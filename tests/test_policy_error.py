@@ -18,7 +18,7 @@ from benchmarks.policy_error import (
     stand_still,
 )
 from xop_lerobot.core.errors import BadDataset, BadValue
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.recording.facts import read_facts
 
 SETTING = Setting("rby1", "dual_point_reach", "empty", "mild", "diff_drive", fps=25, seed=0)
 

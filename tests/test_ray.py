@@ -12,12 +12,12 @@ import pandas as pd
 import pytest
 from eval_jobs import do
 
+from xop_lerobot.collect.cli import main as collect
 from xop_lerobot.core import pool_ray
 from xop_lerobot.core.pool_ray import OtherVersions, RayUnavailable, run_jobs_on_ray
 from xop_lerobot.core.versions import read_versions
-from xop_lerobot.dataset.collect import main as collect
-from xop_lerobot.dataset.curate.cli import main as curate
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.curate.cli import main as curate
+from xop_lerobot.recording.facts import read_facts
 
 REPO = Path(__file__).parents[1]
 SETTINGS = (

@@ -51,7 +51,7 @@ def find_config_class(name: str) -> type:
     if name == "lerobot-record":
         from lerobot.scripts.lerobot_record import RecordConfig as Config
     elif name == "xop-record":
-        from xop_lerobot.dataset.record import XopRecordConfig as Config
+        from xop_lerobot.recording.record import XopRecordConfig as Config
     elif name == "lerobot-teleoperate":
         from lerobot.scripts.lerobot_teleoperate import TeleoperateConfig as Config
     elif name == "lerobot-replay":
@@ -96,10 +96,10 @@ def check_control(flags: list[str]) -> None:
 
 def check_curate(words: list[str]) -> None:
     """Check that a verb takes the flags, and that expressions are ones."""
-    from xop_lerobot.dataset.curate.cli import make_verb_parser
-    from xop_lerobot.dataset.curate.expression import Expression
-    from xop_lerobot.dataset.curate.figures import KINDS
-    from xop_lerobot.dataset.curate.verbs import load_verb
+    from xop_lerobot.curate.cli import make_verb_parser
+    from xop_lerobot.curate.expression import Expression
+    from xop_lerobot.curate.figures import KINDS
+    from xop_lerobot.curate.verbs import load_verb
 
     parsed = make_verb_parser(words[0], load_verb(words[0])).parse(words[1:])
     if hasattr(parsed, "where"):
@@ -119,7 +119,7 @@ def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.Monk
         (parse_bench if command[0] == "xop-bench" else parse_doctor)(command[1:])
         return
     if command[0] == "xop-collect":
-        from xop_lerobot.dataset.collect import parse_arguments as parse_collect
+        from xop_lerobot.collect.cli import parse_arguments as parse_collect
 
         parse_collect(command[1:])[0].check()
         return

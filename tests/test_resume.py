@@ -15,10 +15,10 @@ from test_rollback import read_files
 from toy_robot import make_teleop, make_toy
 
 from xop_lerobot.core.errors import BadDataset, BadValue
-from xop_lerobot.dataset.facts import CONFIG_FILE, CONFIGS_DIR, read_facts
-from xop_lerobot.dataset.record import build_features
-from xop_lerobot.dataset.resume import NotResumable
-from xop_lerobot.dataset.xop_dataset import XopDataset
+from xop_lerobot.recording.dataset import XopDataset
+from xop_lerobot.recording.facts import CONFIG_FILE, CONFIGS_DIR, read_facts
+from xop_lerobot.recording.record import build_features
+from xop_lerobot.recording.resume import NotResumable
 
 HINT = "Record as it was recorded, or begin another --dataset.root without --resume=true"
 

@@ -19,10 +19,10 @@ from lerobot_rows import get_row
 from test_dataset import REPO, STREAMING, create, pair, session, tick  # noqa: F401  fixtures
 from toy_robot import make_toy
 
-from xop_lerobot.dataset import xop_dataset
-from xop_lerobot.dataset.facts import append_facts, read_facts
-from xop_lerobot.dataset.rollback import NotSaved, find_reason
-from xop_lerobot.dataset.xop_dataset import NotMade, XopDataset
+from xop_lerobot.recording import dataset as xop_dataset
+from xop_lerobot.recording.dataset import NotMade, XopDataset
+from xop_lerobot.recording.facts import append_facts, read_facts
+from xop_lerobot.recording.rollback import NotSaved, find_reason
 
 FULL = "No space left on device"
 
@@ -78,7 +78,7 @@ POINTS = {
 def test_a_full_disk_costs_one_episode(
     session, pair, tmp_path, monkeypatch, point, rotates  # noqa: F811
 ):  # fmt: skip
-    monkeypatch.setattr("xop_lerobot.dataset.durability.can_rotate", lambda _: rotates)
+    monkeypatch.setattr("xop_lerobot.recording.durability.can_rotate", lambda _: rotates)
     root = tmp_path / "data"
     dataset = create(session, pair[0], root, **STREAMING)
     for _ in range(2):
@@ -138,7 +138,7 @@ def test_what_cannot_be_taken_back_is_repaired(
     dataset.save_episode()
     record(pair, dataset)
     monkeypatch.setattr(dataset_metadata, "write_info", cut("meta/info.json"))
-    monkeypatch.setattr("xop_lerobot.dataset.rollback.replace_file", is_full)
+    monkeypatch.setattr("xop_lerobot.recording.rollback.replace_file", is_full)
     with pytest.raises(NotSaved) as caught:
         dataset.save_episode()
     assert str(caught.value) == (

@@ -16,7 +16,7 @@ from toy_robot import XopToyConfig
 
 from lerobot_robot_xop import XopRobotConfig
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.dataset.rollout_pictures import watch_rollouts
+from xop_lerobot.recording.rollout_pictures import watch_rollouts
 
 EVENT = Event()
 TEXT = (

@@ -12,7 +12,6 @@ from toy_robot import Toy, make_teleop, make_toy
 
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.transforms import quat_from_yaw
-from xop_lerobot.dataset.facts import read_facts
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
@@ -22,6 +21,7 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.plant.watch import GIVES_WAY, MOVES, Watch
+from xop_lerobot.recording.facts import read_facts
 
 every_robot = pytest.mark.parametrize("name", ["g1", "rby1", "toy"])
 

@@ -24,7 +24,7 @@ from headset_rig import RETARGETER
 from lerobot.datasets import LeRobotDataset
 from ports import find_port
 
-from xop_lerobot.dataset.facts import read_facts
+from xop_lerobot.recording.facts import read_facts
 
 pytestmark = pytest.mark.slow
 REPO = Path(__file__).parents[1]

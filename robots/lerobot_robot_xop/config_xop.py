@@ -9,8 +9,8 @@ from lerobot.robots.config import RobotConfig
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.yaml_words import fill_nulls, find_text, find_word, recover_typed
-from xop_lerobot.dataset.rollout_pictures import watch_rollouts
 from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
+from xop_lerobot.recording.rollout_pictures import watch_rollouts
 from xop_lerobot.tasks.heights import parse_heights
 from xop_lerobot.tasks.task import get_task
 

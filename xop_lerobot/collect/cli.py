@@ -1,0 +1,159 @@
+r"""`xop-collect`: tasks as LeRobot datasets, with success labels and without anybody there.
+
+    xop-collect --robot g1 --task box_pick_and_place --episodes 50 --seed 0 \
+        --root outputs/boxes --repo-id me/boxes
+
+A simulated operator does the task over and over, headless and in as many processes as there are
+cores. Episode i is the same whatever their number. Ctrl-C, SIGTERM and `kill -9` lose only the
+episodes under way: the same command again goes on, and with more `--episodes` adds to a dataset.
+The last line of standard output is one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from xop_lerobot.collect.config import CollectConfig
+from xop_lerobot.collect.flags import add_config, add_crew, read_config
+from xop_lerobot.collect.folder import CollectFolder
+from xop_lerobot.collect.jobs import WorkerFailed
+from xop_lerobot.collect.run import run_collection
+from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.errors import BadValue, XopError
+from xop_lerobot.core.shutdown import stop_on_sigterm
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C or SIGTERM."""
+
+
+@dataclass(frozen=True)
+class CollectResult:
+    """What there is in the end.
+
+    Attributes:
+        episodes: Episodes that were run, of this and of all runs before.
+        successes: Those in which the task was accomplished.
+        frames: Frames of the dataset.
+        sim_s: Simulated time of all episodes, without the settling before them [s].
+        wall_s: Time that all runs took, each killed one until its last finished episode [s].
+        root: Directory of the dataset.
+    """
+
+    episodes: int
+    successes: int
+    frames: int
+    sim_s: float
+    wall_s: float
+    root: str
+
+
+def collect(
+    config: CollectConfig,
+    root: Path,
+    episodes: int,
+    repo_id: str = "",
+    workers: int = 0,
+    ray: str = "",
+) -> CollectResult:
+    """Collect a dataset, or what is missing of it.
+
+    Args:
+        config: What is collected.
+        root: Directory of the dataset.
+        episodes: How many episodes there shall be.
+        repo_id: Name of the dataset; empty for `local/` and the directory's name.
+        workers: Number of workers; 0 for one for each core.
+        ray: Address of a Ray cluster that makes them; empty for processes of this machine.
+
+    Raises:
+        XopError: If a setting is not valid, the directory is taken, or an episode fails.
+    """
+    for name, value, low in (("episodes", episodes, 1), ("workers", workers, 0)):
+        if value < low:
+            raise BadValue(f"{name} must be at least {low}, got {value}")
+    config.check()
+    folder = CollectFolder(root)
+    collection = run_collection(
+        config, folder, range(episodes), repo_id=repo_id, workers=workers, ray=ray
+    )
+    attempts = collection.attempts
+    if not folder.root.exists():
+        print(f"no episode succeeded: '{root}' is not made", file=sys.stderr)
+    return CollectResult(
+        episodes=len(attempts),
+        successes=sum(attempt.success for attempt in attempts),
+        frames=sum(attempt.frames for attempt in attempts if attempt.kept),
+        sim_s=round(sum(attempt.frames for attempt in attempts) / config.fps, 3),
+        wall_s=round(collection.wall_s, 3),
+        root=str(root),
+    )
+
+
+def make_parser() -> CommandParser:
+    """Make the parser of the command line."""
+    parser = CommandParser("xop-collect", __doc__)
+    add = parser.add_argument
+    add("--robot", required=True, help="robot: g1 or rby1")
+    add(
+        "--task",
+        required=True,
+        help="dual_point_touch, dual_point_reach, box_pick_and_place or non_prehensile_transport",
+    )
+    add("--episodes", required=True, type=int, help="how many episodes there shall be")
+    add("--root", required=True, type=Path, help="directory of the dataset")
+    add(
+        "--repo-id",
+        default="",
+        help="name of the dataset; empty: local/<directory> (default: none)",
+    )
+    add_crew(parser)
+    add_config(parser)
+    device = CollectConfig.device
+    add(
+        "--device",
+        default=device,
+        help=f"operator device: simulated, or one of a plugin (default: {device})",
+    )
+    add("--only-successful", action="store_true", help="leave episodes without success out")
+    return parser
+
+
+def parse_arguments(arguments: Sequence[str]) -> tuple[CollectConfig, argparse.Namespace]:
+    """Read the command line.
+
+    Raises:
+        BadValue: If a flag is absent or malformed.
+        UnknownName: If one is unknown, listing the known ones.
+    """
+    args = make_parser().parse(arguments)
+    return read_config(CollectConfig, args), args
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `xop-collect`; returns the exit code."""
+    make_output_readable()
+    args = None
+    try:
+        config, args = parse_arguments(sys.argv[1:] if arguments is None else arguments)
+        with stop_on_sigterm():
+            result = collect(config, args.root, args.episodes, args.repo_id, args.workers, args.ray)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on with the finished episodes", file=sys.stderr)
+        return INTERRUPTED
+    except XopError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1 if isinstance(error, WorkerFailed) else 2
+    except OSError as error:  # a full disk, for example
+        print(f"error: {error}. The same command goes on with what is finished", file=sys.stderr)
+        return 1
+    print(json.dumps(vars(result)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

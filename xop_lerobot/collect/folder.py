@@ -1,0 +1,278 @@
+"""The files of a collection while it runs, so that it can be killed and go on at any moment.
+
+Until the dataset is whole, everything lies beside its directory, in `<root>.collecting`:
+
+    settings.json            what is collected; another run must ask for the same
+    lock                     held by the run that is at work
+    attempts/000007/         a finished episode: attempt.json, and dataset/ if it is kept
+    attempts/tmp-…/          an episode under way
+    merged/                  the dataset being put together
+    previous/                the dataset that `merged` replaces, for as long as that takes
+
+Every step from one state to the next is one rename, after the files are on the disk.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.recording.facts import FACTS_DIR
+
+COLLECT_FILE = FACTS_DIR / "collect.json"
+"""What a collected dataset says of its collection."""
+DATASET = "dataset"
+"""Directory of an episode's own dataset in its folder."""
+
+
+class FolderTaken(XopError, FileExistsError):
+    """The directory holds something that this collection must not touch."""
+
+
+class OtherSettings(XopError):
+    """The directory holds a collection with other settings.
+
+    Args:
+        root: Directory of the dataset.
+        held: Settings of the collection that is there.
+        asked: Settings that were asked for.
+        flag: Flag that names the directory.
+    """
+
+    def __init__(
+        self, root: Path, held: Mapping[str, Any], asked: Mapping[str, Any], flag: str
+    ) -> None:
+        names = [name for name in asked if held.get(name) != asked[name]]
+        pairs = ", ".join(
+            f"{name} {_show(held.get(name))} (asked for: {_show(asked[name])})" for name in names
+        )
+        super().__init__(
+            f"'{root}' was made with other settings: {pairs}. Ask for the same, choose "
+            f"another {flag}, or delete it"
+        )
+
+
+def _show(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else json.dumps(value).strip('"')
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One episode, whether it is kept in the dataset or not.
+
+    Attributes:
+        index: Which of the collection's episodes; with the seed it decides the content.
+        success: Whether the task was accomplished.
+        failure: Why not, in words; empty if unknown.
+        kept: Whether it is in the dataset.
+        frames: Frames.
+        run: When the run that made it began [s since the epoch].
+        elapsed: Time from then until it was finished [s].
+        cpu_s: Time that processors worked for it [s].
+    """
+
+    index: int
+    success: bool
+    failure: str
+    kept: bool
+    frames: int
+    run: float
+    elapsed: float
+    cpu_s: float
+
+
+class CollectFolder:
+    """A collection's files.
+
+    Args:
+        root: Directory of the dataset that is being collected.
+
+    Attributes:
+        root: The same.
+        work: Directory of all that is not finished.
+        command: Command whose files these are, as it reads in an error.
+        flag: Its flag that names the directory.
+        record: File in which the dataset says how it was made.
+    """
+
+    command: ClassVar[str] = "xop-collect"
+    flag: ClassVar[str] = "--root"
+    record: ClassVar[Path] = COLLECT_FILE
+
+    def __init__(self, root: Path) -> None:
+        self.root = root.resolve()
+        self.work = self.root.with_name(f"{self.root.name}.collecting")
+        self.merged, self.previous = self.work / "merged", self.work / "previous"
+        self._attempts, self._settings = self.work / "attempts", self.work / "settings.json"
+
+    @contextmanager
+    def hold(self, settings: Mapping[str, Any]) -> Iterator[None]:
+        """Check that this collection may work here, and let no other run in meanwhile.
+
+        Raises:
+            FolderTaken: If the directory holds something else, or another run is at work.
+            OtherSettings: If it holds a collection with other settings.
+        """
+        self._check_root()
+        self.work.mkdir(parents=True, exist_ok=True)
+        with (self.work / "lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise FolderTaken(
+                    f"another {self.command} is at work on '{self.root}'. Wait for it, or choose "
+                    f"another {self.flag}"
+                ) from None
+            try:
+                self._finish_exchange()
+                self._check_settings(settings)
+                self._clean_up()
+                yield
+            finally:
+                self._drop_drafts()
+                if not self._settings.exists() or self._is_empty():
+                    shutil.rmtree(self.work, ignore_errors=True)
+
+    def _check_root(self) -> None:
+        root = self.root
+        if root.is_mount():
+            raise FolderTaken(
+                f"'{root}' is a mount point, which a dataset can't take the place of. Choose a "
+                f"directory inside it as {self.flag}"
+            )
+        if not root.exists() or (root / self.record).exists():
+            return
+        if (root / "meta" / "info.json").exists():
+            raise FolderTaken(
+                f"'{root}' holds a dataset that {self.command} did not make. Choose another "
+                f"{self.flag}, or delete it"
+            )
+        if not root.is_dir() or any(root.iterdir()):
+            raise FolderTaken(
+                f"'{root}' exists and is no dataset. Choose another {self.flag}, or delete it"
+            )
+
+    def _finish_exchange(self) -> None:
+        """Finish an exchange of datasets that was cut between its two renames."""
+        if self.previous.exists() and not self.root.exists():
+            # `merged` was whole before the first.
+            os.rename(self.merged if self.merged.exists() else self.previous, self.root)
+
+    def _clean_up(self) -> None:
+        """Delete what a killed run was at: a merge, episodes under way, or its own cleaning."""
+        in_dataset = (self._find(each["index"]) for each in self.read_dataset().get("attempts", ()))
+        for folder in (self.merged, self.previous, *in_dataset):
+            shutil.rmtree(folder, ignore_errors=True)
+        self._drop_drafts()
+
+    def _drop_drafts(self) -> None:
+        for folder in self._attempts.glob("tmp-*"):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _check_settings(self, settings: Mapping[str, Any]) -> None:
+        held = self.read_dataset().get("settings")
+        if held is None and self._settings.exists():
+            held = json.loads(self._settings.read_text(encoding="utf-8"))
+        if held is not None and held != settings:
+            raise OtherSettings(self.root, held, settings, self.flag)
+        self._attempts.mkdir(exist_ok=True)
+        write_whole(self._settings, settings)
+
+    def _is_empty(self) -> bool:
+        """Whether nothing has been collected that is not in the dataset yet."""
+        return not self.merged.exists() and not any(self._attempts.glob("*"))
+
+    def _find(self, index: int) -> Path:
+        return self._attempts / f"{index:06d}"
+
+    # Episodes.
+
+    def read_dataset(self) -> dict[str, Any]:
+        """Read what the finished dataset says of its collection; empty while there is none."""
+        path = self.root / self.record
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+    def list_attempts(self) -> dict[int, Attempt]:
+        """List all finished episodes by index, those in the dataset and those beside it."""
+        rows = [Attempt(**row) for row in self.read_dataset().get("attempts", ())]
+        return {attempt.index: attempt for attempt in rows} | self.read_attempts()
+
+    def read_attempts(self) -> dict[int, Attempt]:
+        """Read the finished episodes that are not in the dataset yet, by index."""
+        found = {}
+        for path in sorted(self._attempts.glob("[0-9]*/attempt.json")):
+            attempt = Attempt(**json.loads(path.read_text(encoding="utf-8")))
+            found[attempt.index] = attempt
+        return found
+
+    def get_dataset(self, index: int) -> Path:
+        """Return the dataset that holds the finished episode `index` alone."""
+        return self._find(index) / DATASET
+
+    def open_attempt(self, index: int) -> Path:
+        """Make the directory of episode `index`, to work in."""
+        folder = self._attempts / f"tmp-{index:06d}-{os.getpid()}"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return folder
+
+    def close_attempt(self, folder: Path, attempt: Attempt) -> None:
+        """Let an episode count: from now on no kill can lose it.
+
+        One without a single frame does not, and its directory goes.
+        """
+        if not attempt.frames:
+            shutil.rmtree(folder)
+            return
+        write_whole(folder / "attempt.json", dataclasses.asdict(attempt))
+        sync_tree(folder)
+        os.rename(folder, self._find(attempt.index))
+        sync_folder(self._attempts)
+
+    def exchange(self, indices: Iterable[int]) -> None:
+        """Put the merged dataset in the place of the one before.
+
+        Args:
+            indices: Episodes that are in it; their own files are deleted.
+        """
+        sync_tree(self.merged)
+        if self.root.exists() and any(self.root.iterdir()):
+            os.rename(self.root, self.previous)
+        os.rename(self.merged, self.root)
+        sync_folder(self.root.parent)
+        for folder in (self.previous, *map(self._find, indices)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_whole(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file that is there as a whole or not at all."""
+    draft = path.with_name(f"{path.name}.tmp")
+    draft.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    os.replace(draft, path)
+
+
+def sync_tree(folder: Path) -> None:
+    """See everything under `folder` on the disk."""
+    for path, _, names in os.walk(folder):
+        for name in names:
+            with (Path(path) / name).open("rb") as file:
+                os.fsync(file.fileno())
+        sync_folder(Path(path))
+
+
+def sync_folder(folder: Path) -> None:
+    """See the names in `folder` on the disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,111 @@
+"""Put single episodes together to one dataset, in the order of their indices."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from lerobot.datasets import aggregate, dataset_metadata
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.utils import EPISODES_DIR
+
+from xop_lerobot.collect.folder import CollectFolder, write_whole
+from xop_lerobot.recording.facts import CONFIG_FILE, EPISODES_FILE, FACTS_DIR, read_facts
+
+
+def merge_attempts(
+    folder: CollectFolder,
+    indices: Container[int],
+    repo_id: str,
+    settings: Mapping[str, Any],
+    note_walls: Callable[[], Mapping[str, float]],
+) -> None:
+    """Merge the dataset that is there, if any, and finished episodes into a new one.
+
+    As when they are recorded one after another, each episode has files of its own, and its facts
+    are in `meta/xop/episodes.jsonl`. Nothing of what was there is changed before the new dataset
+    is whole; then one takes the other's place. Without a single episode to keep, nothing happens.
+
+    Args:
+        folder: The collection's files.
+        indices: Episodes that are merged; others stay for another time.
+        repo_id: Name of the dataset.
+        settings: What was collected.
+        note_walls: Tells how long each run took so far [s], by its start.
+    """
+    attempts = [each for index, each in folder.read_attempts().items() if index in indices]
+    before = folder.read_dataset()
+    sources = [folder.root] if before else []
+    sources += [folder.get_dataset(attempt.index) for attempt in attempts if attempt.kept]
+    if not sources:
+        return
+    merged = folder.merged
+    shutil.rmtree(merged, ignore_errors=True)
+    with (
+        _replaced(dataset_metadata, "load_episodes", _load_episodes),
+        _replaced(aggregate, "tqdm", SimpleNamespace(tqdm=_show_nothing)),
+    ):
+        aggregate_datasets(
+            [repo_id] * len(sources),
+            repo_id,
+            roots=sources,
+            aggr_root=merged,
+            concatenate_videos=False,
+            concatenate_data=False,
+        )
+    _merge_facts(sources, merged)
+    rows = [*before.get("attempts", ()), *map(dataclasses.asdict, attempts)]
+    document = {"settings": settings, "walls": note_walls(), "attempts": rows}
+    write_whole(merged / folder.record, document)
+    folder.exchange(attempt.index for attempt in attempts)
+
+
+def _merge_facts(sources: Sequence[Path], merged: Path) -> None:
+    """Take the facts on the episodes along; LeRobot merges only what is its own."""
+    (merged / FACTS_DIR).mkdir(parents=True, exist_ok=True)
+    shutil.copy(sources[-1] / CONFIG_FILE, merged / CONFIG_FILE)
+    rows = [row for source in sources for row in read_facts(source)]
+    with (merged / EPISODES_FILE).open("w", encoding="utf-8") as file:
+        for index, row in enumerate(rows):
+            file.write(json.dumps({**row, "episode_index": index}) + "\n")
+
+
+@contextmanager
+def _replaced(module: ModuleType, name: str, ours: Any) -> Iterator[None]:
+    """In the block, give LeRobot's module another `name`; nothing where it has none."""
+    if not hasattr(module, name):
+        yield
+        return
+    stock = getattr(module, name)
+    setattr(module, name, ours)
+    try:
+        yield
+    finally:
+        setattr(module, name, stock)
+
+
+def _show_nothing(things: Iterable[Any], **options: Any) -> Iterable[Any]:
+    """Stand for LeRobot's progress bars, which would be among the command's own lines."""
+    del options
+    return things
+
+
+def _load_episodes(root: Path) -> dict[str, list]:
+    """Read the columns of a dataset's episode metadata, but for the statistics.
+
+    LeRobot's own goes through `datasets`, which takes a second for the 900 columns of a single
+    episode.
+    """
+    tables = []
+    for path in sorted((root / EPISODES_DIR).glob("*/*.parquet")):
+        names = [name for name in pq.read_schema(path).names if not name.startswith("stats/")]
+        tables.append(pq.read_table(path, columns=names))
+    return pa.concat_tables(tables).to_pydict()

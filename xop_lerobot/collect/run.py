@@ -1,0 +1,151 @@
+"""Make the episodes of a dataset that are missing, and put all together."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+from tqdm import tqdm
+
+from xop_lerobot.collect.folder import Attempt, CollectFolder
+from xop_lerobot.collect.jobs import make_attempts
+from xop_lerobot.core.wording import say_count
+
+if TYPE_CHECKING:
+    from xop_lerobot.collect.config import CollectConfig
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What there is in the end.
+
+    Attributes:
+        attempts: Episodes of the dataset and all that were asked for.
+        wall_s: Time that all runs took, each killed one until its last finished episode [s].
+    """
+
+    attempts: tuple[Attempt, ...]
+    wall_s: float
+
+
+def run_collection(
+    config: CollectConfig,
+    folder: CollectFolder,
+    indices: Sequence[int],
+    *,
+    repo_id: str = "",
+    workers: int = 0,
+    ray: str = "",
+    quiet: bool = False,
+    make_jobs: Callable[[Sequence[int]], Iterable[Any]] = iter,
+) -> Collection:
+    """Make the episodes that are not there yet, and merge all into one dataset.
+
+    Args:
+        config: What is collected.
+        folder: Where to.
+        indices: Which episodes there shall be.
+        repo_id: Name of the dataset; empty for `local/` and the directory's name.
+        workers: Number of workers; 0 for one for each core.
+        ray: Address of a Ray cluster; empty for processes of this machine.
+        quiet: Whether to show no progress.
+        make_jobs: Makes jobs for those of the indices that are missing, as `config`'s maker
+            takes them.
+
+    Raises:
+        XopError: If the directory is taken, or an episode fails.
+    """
+    begin, start = time.time(), time.perf_counter()
+    settings = config.to_settings()
+    with folder.hold(settings):
+        done = folder.list_attempts()
+        missing = [index for index in indices if index not in done]
+        # Closed at once, whatever happens: no worker may outlive the hold on the folder.
+        made = make_attempts(config, folder, make_jobs(missing), workers, begin, ray)
+        with _Progress(config, len(missing), quiet=quiet) as progress, closing(made):
+            if done:
+                are = "is" if len(done) == 1 else "are"
+                progress.say(f"{say_count(len(done), 'episode')} {are} there already")
+            for attempt in made:
+                done[attempt.index] = attempt
+                progress.note(attempt)
+            are_new = bool(folder.read_attempts().keys() & set(indices))
+            if are_new:
+                progress.say("putting the episodes together")
+        walls = _compute_walls(folder, done)
+
+        def note_walls() -> dict[str, float]:
+            return walls | {str(begin): time.perf_counter() - start}
+
+        merged = folder.read_dataset()
+        if are_new:
+            from xop_lerobot.collect.merge import merge_attempts  # noqa: PLC0415 torch
+
+            repo_id = repo_id or f"local/{folder.root.name}"
+            merge_attempts(folder, indices, repo_id, settings, note_walls)
+            merged, walls = folder.read_dataset(), note_walls()
+        counted = [Attempt(**row) for row in merged.get("attempts", ())]
+        held = {attempt.index for attempt in counted}
+        counted += [done[index] for index in indices if index not in held]
+    return Collection(tuple(counted), sum(walls.values()))
+
+
+def _compute_walls(folder: CollectFolder, attempts: dict[int, Attempt]) -> dict[str, float]:
+    """Compute how long each run took [s], by its start; a killed one until its last episode."""
+    walls: dict[str, float] = dict(folder.read_dataset().get("walls", {}))
+    for attempt in attempts.values():
+        run = str(attempt.run)
+        walls[run] = max(walls.get(run, 0.0), attempt.elapsed)
+    return walls
+
+
+class _Progress:
+    """Says on standard error how far it is: a line an episode, and a bar where it is a terminal.
+
+    Args:
+        config: What is collected.
+        missing: How many episodes are still to be made.
+        quiet: Whether to say nothing.
+    """
+
+    def __init__(self, config: CollectConfig, missing: int, *, quiet: bool) -> None:
+        self._config, self._missing, self._quiet = config, missing, quiet
+        self._start = time.perf_counter()
+        self._made = self._frames = self._successes = 0
+        # None: no bar where standard error is no terminal.
+        self._bar = tqdm(total=missing, unit="episode", disable=quiet or None, leave=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def say(self, text: str) -> None:
+        """Say something, above the bar."""
+        if self._quiet:
+            return
+        if self._bar.disable:
+            print(text, file=sys.stderr, flush=True)
+        else:
+            self._bar.write(text, file=sys.stderr)
+
+    def note(self, attempt: Attempt) -> None:
+        """Say what came of one episode."""
+        self._made += 1
+        self._frames += attempt.frames
+        self._successes += attempt.success
+        elapsed = time.perf_counter() - self._start
+        left = elapsed / self._made * (self._missing - self._made)
+        seconds = 1 / self._config.fps
+        succeeded = f"{self._successes} succeeded, " if self._config.task else ""
+        self._bar.update()
+        self.say(
+            f"episode {attempt.index}: {self._config.describe(attempt)}, "
+            f"{attempt.frames * seconds:.1f} s. {self._made} of {self._missing} made, {succeeded}"
+            f"{self._frames * seconds / elapsed:.2f} x real time, {left / 60:.1f} min left"
+        )

@@ -1,0 +1,157 @@
+"""One worker of `xop-collect`: robot, simulated operator and one dataset for each episode.
+
+The robot and the teleoperator are the LeRobot devices that `lerobot-record` uses, run in
+lock-step, and the frames go through the same `XopDataset`. The teleoperator is made anew for each
+episode, which takes a few hundredths of a second, and the robot starts over with a seed made of
+the collection's and the episode's index: an episode can't depend on those before it.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import av
+import av.logging
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.utils.import_utils import make_device_from_device_class
+
+from xop_lerobot.collect.config import CollectConfig, import_plugins
+from xop_lerobot.collect.folder import DATASET, Attempt
+from xop_lerobot.collect.jobs import get_index
+from xop_lerobot.link import get_session
+from xop_lerobot.recording.dataset import XopDataset
+from xop_lerobot.recording.lockstep import count_ticks
+from xop_lerobot.recording.record import build_features
+from xop_lerobot.recording.tick import run_tick
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from lerobot_robot_xop.xop_robot import XopRobot
+    from lerobot_teleoperator_xop.xop import Xop
+    from xop_lerobot.tasks.task import Task
+
+_GRACE_S = 10.0
+"""How long after a task's own time limit an episode is ended all the same [s]."""
+_QUEUE = 60
+"""Pictures that may wait for the encoder; lock-step waits when it is full."""
+
+
+class Collector:
+    """Makes single episodes of a collection, in any order.
+
+    Args:
+        config: What is collected.
+        run: When this run began [s since the epoch].
+    """
+
+    def __init__(self, config: CollectConfig, run: float) -> None:
+        import_plugins(config.plugins)
+        _calm_down()
+        self.config, self.run = config, run
+        self.robot: XopRobot = make_device_from_device_class(config.make_robot_config())
+        self.session = get_session(self.robot.config.session)
+        self.robot.connect()
+
+    def make(self, job: Any, folder: Path) -> Attempt:
+        """Make an episode.
+
+        Args:
+            job: The episode: its index, or what has one.
+            folder: Directory of its own; the episode is the dataset `DATASET` in it.
+        """
+        cpu = time.process_time()
+        index = get_index(job)
+        teleop: Xop = make_device_from_device_class(self.config.make_teleop_config())
+        # LeRobot's own loop is not used here, so it needs no help.
+        teleop.host.remove()
+        teleop.connect()
+        try:
+            dataset = self._create(folder / DATASET)
+            try:
+                self.begin(job, teleop, dataset)
+                frames = self._run(job, teleop, dataset)
+                outcome = self.session.outcome
+                success = outcome is not None and outcome.success
+                kept = success or not self.config.only_successful
+                if kept:
+                    dataset.save_episode()
+                else:
+                    dataset.clear_episode_buffer()
+            finally:
+                dataset.finalize()
+        finally:
+            teleop.disconnect()
+        return Attempt(
+            index,
+            success,
+            failure="" if success else str(getattr(outcome, "failure", "")),
+            kept=kept,
+            frames=frames,
+            run=self.run,
+            elapsed=time.time() - self.run,
+            cpu_s=time.process_time() - cpu,
+        )
+
+    def _create(self, root: Path) -> XopDataset:
+        config = self.config
+        return XopDataset.bind(self.session.name).create(
+            "local/episode",
+            config.fps,
+            build_features(self.robot, use_videos=config.video),
+            root=root,
+            robot_type=self.robot.name,
+            use_videos=config.video,
+            # As in configs/record_*.yaml: the setting that costs the planner least.
+            rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="ultrafast"),
+            encoder_threads=1,
+            streaming_encoding=config.video,
+            encoder_queue_maxsize=_QUEUE,
+            image_writer_threads=0 if config.video else len(config.cameras),
+        )
+
+    def _run(self, job: Any, teleop: Xop, dataset: XopDataset) -> int:
+        """Run the episode until its task, its operator or its time is over; return its frames."""
+        self.session.begin_episode(get_index(job))
+        events = {"exit_early": False}
+        dataset.begin(events, self.get_limit(job))
+        frames = 0
+        while not events["exit_early"]:
+            run_tick(self.robot, teleop, dataset, self.get_instruction(job, frames))
+            frames += 1
+            outcome = self.session.outcome
+            if outcome is not None and outcome.done:
+                break
+        return frames
+
+    # What depends on the kind of collection.
+
+    def begin(self, job: Any, teleop: Xop, dataset: XopDataset) -> None:
+        """Do what must be done before the first frame of an episode."""
+
+    def get_limit(self, job: Any) -> int:
+        """Frames after which an episode is ended in any case."""
+        del job
+        return count_ticks(self._task.time_limit + _GRACE_S, self.config.fps)
+
+    def get_instruction(self, job: Any, frame: int) -> str:
+        """The task in words, at a frame of an episode."""
+        del job, frame
+        return self._task.instruction
+
+    @cached_property
+    def _task(self) -> Task:
+        return self.config.make_task()
+
+    def close(self) -> None:
+        """Let go of the robot; may be called twice."""
+        self.robot.disconnect()
+
+
+def _calm_down() -> None:
+    """Leave out what encoders and decoders tell of themselves."""
+    av.logging.set_libav_level(av.logging.ERROR)
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

@@ -1,0 +1,76 @@
+"""`xop-curate`: look at recorded datasets, throw out what is bad, mend, cut and multiply them.
+
+    xop-curate VERB --root DIR [--out DIR] ...
+
+No verb changes the dataset that it reads, unless `--in-place` asks for it. A new dataset is built
+beside its place and gets there as a whole in the end, so a crash leaves everything as it was.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.errors import BadValue, UnknownName, XopError
+from xop_lerobot.core.shutdown import stop_on_sigterm
+from xop_lerobot.curate.verbs import VERBS, Verb, load_verb
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C or SIGTERM, as shells have it."""
+WRONG_USAGE = 2
+"""Exit code of a command line that is not understood."""
+
+
+def make_parser() -> CommandParser:
+    """Make the parser of the command without a verb; it knows `--help` alone."""
+    width = max(map(len, VERBS), default=0)
+    lines = [f"  {name:{width}}  {load_verb(name).SUMMARY}" for name in VERBS]
+    parser = CommandParser(
+        "xop-curate",
+        __doc__,
+        usage="xop-curate VERB [flags]",
+        epilog="verbs:\n" + "\n".join(lines) + "\n\n`xop-curate VERB --help` lists its flags.",
+    )
+    return parser
+
+
+def make_verb_parser(name: str, verb: Verb) -> CommandParser:
+    """Make the parser of one verb's flags."""
+    text = verb.__doc__ or verb.SUMMARY
+    parser = CommandParser(f"xop-curate {name}", text)
+    verb.add_arguments(parser)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `xop-curate`; returns the exit code."""
+    make_output_readable()
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        if not words or words[0].startswith("-"):
+            parser = make_parser()
+            parser.parse(words)
+            raise BadValue(f"a verb is missing. Known: {', '.join(VERBS)}")
+        verb = load_verb(words[0])
+        parsed = make_verb_parser(words[0], verb).parse(words[1:])
+    except XopError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return WRONG_USAGE
+    try:
+        with stop_on_sigterm():
+            return verb.run(parsed)
+    except KeyboardInterrupt:
+        print("stopped; nothing was changed", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of the table has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (XopError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return WRONG_USAGE if isinstance(error, BadValue | UnknownName) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

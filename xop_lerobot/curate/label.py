@@ -1,0 +1,290 @@
+r"""Label episodes with success and sub-tasks, by rule, by hand or from a file.
+
+    xop-curate label --root outputs/week --out outputs/labelled \
+        --success "not fall and duration > 3"
+    xop-curate label --root outputs/week --out outputs/labelled \
+        --subtask "down=robot_head_z < 1.0" --subtask "up=time > 1"
+    xop-curate label --root outputs/week --out outputs/labelled \
+        --by-hand labels.json --names reach,lift
+
+--success is an expression over the figures of an episode, as in `filter`; where it is not known,
+the label stays. --subtask is one over what a frame has: each entry of each column by its name with
+`_` for dots (robot_head_z, action_mode_pos), time, left and frame; the first that holds counts.
+By hand, the episodes are shown in a window, or as strips of pictures where there is no display;
+every answer is kept in the file at once, and the next run goes on from there.
+
+Success goes to the facts and to `next.success`. Sub-tasks go to the column `subtask_index`, which
+`meta/subtasks.parquet` names, and to the facts.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Generator, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.wording import say_count
+from xop_lerobot.curate.arguments import (
+    add_destination,
+    add_source,
+    make_destination,
+    show_progress,
+)
+from xop_lerobot.curate.expression import Expression
+from xop_lerobot.curate.figures import KINDS
+from xop_lerobot.curate.frame_rules import OTHER, FrameRules
+from xop_lerobot.curate.labels import (
+    Label,
+    list_runs,
+    number_frames,
+    read_labels,
+    set_success,
+)
+from xop_lerobot.curate.source import EpisodeEntry, Source
+from xop_lerobot.curate.subtasks import SUBTASK, write_subtasks
+
+if TYPE_CHECKING:
+    from xop_lerobot.curate.clip import Clip
+
+SUMMARY = "label success and sub-tasks, by rule, by hand or from a file"
+
+SUCCESS = "next.success"
+FEATURES: Mapping[str, Mapping[str, Any]] = {
+    SUCCESS: {"dtype": "bool", "shape": [1], "names": ["success"]},
+    SUBTASK: {"dtype": "int64", "shape": [1], "names": None},
+}
+_VIEWS = ("auto", "window", "terminal")
+_STRIP = 8
+"""Pictures of a strip."""
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the verb's flags."""
+    add_source(parser)
+    add_destination(parser)
+    parser.add_argument(
+        "--success", metavar="EXPRESSION", help="which episodes succeeded, by their figures"
+    )
+    parser.add_argument(
+        "--subtask",
+        action="append",
+        default=[],
+        metavar="NAME=EXPRESSION",
+        help="in which frames a sub-task is done; may be given several times",
+    )
+    parser.add_argument("--labels", type=Path, metavar="FILE", help="JSON file of labels")
+    parser.add_argument(
+        "--by-hand", type=Path, metavar="FILE", help="ask for labels, and keep them in this file"
+    )
+    parser.add_argument(
+        "--names", default="", metavar="A,B", help="by hand: sub-tasks, numbered from 1"
+    )
+    parser.add_argument(
+        "--view",
+        choices=_VIEWS,
+        default="auto",
+        help="by hand: window, terminal with strips of pictures beside FILE, or auto (default): "
+        "a window where there is a display",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Label a dataset; returns the exit code."""
+    ways = [arguments.success or arguments.subtask, arguments.labels, arguments.by_hand]
+    if sum(map(bool, ways)) != 1:
+        raise BadValue("give rules (--success, --subtask), --labels or --by-hand, and one of them")
+    with Source(arguments.root) as source:
+        destination = make_destination(arguments, source.root)
+        labeller = _make_labeller(arguments, source)
+        clips = labeller.make_clips(quiet=arguments.quiet)
+        if destination is None:
+            for _ in clips:
+                pass
+        else:
+            from xop_lerobot.curate.transfer import Step, transfer  # noqa: PLC0415 torch
+
+            file = arguments.labels or arguments.by_hand
+            step = Step.now(
+                "label",
+                success=arguments.success,
+                subtask=arguments.subtask or None,
+                labels=file and file.name,
+            )
+            with destination as draft, closing(clips):
+                transfer(clips, draft, step, labeller.features)
+                if labeller.names:
+                    write_subtasks(draft, labeller.names)
+    labeller.report()
+    if destination is not None:
+        print(f"written to {destination.root}")
+    return 0
+
+
+def _make_labeller(arguments: argparse.Namespace, source: Source) -> Labeller:
+    if arguments.labels is not None:
+        if not arguments.labels.is_file():
+            raise BadValue(f"there are no labels '{arguments.labels}'")
+        return Labeller(source, labels=read_labels(arguments.labels))
+    if arguments.by_hand is not None:
+        names = [name.strip() for name in arguments.names.split(",") if name.strip()]
+        labels = ask(source, arguments.by_hand, names, arguments.view)
+        return Labeller(source, labels=labels)
+    success = Expression(arguments.success, KINDS) if arguments.success else None
+    rules = FrameRules(source, arguments.subtask) if arguments.subtask else None
+    return Labeller(source, success, rules)
+
+
+class Labeller:
+    """Labels the episodes of a dataset.
+
+    Args:
+        source: The dataset.
+        success: Which episodes succeeded, by rule.
+        rules: Sub-tasks, by rule.
+        labels: Labels by episode.
+
+    Attributes:
+        names: Names of the sub-tasks; empty where none are labelled.
+        features: Features of the columns that are new.
+
+    Raises:
+        BadValue: If there are labels of episodes that are not there.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        success: Expression | None = None,
+        rules: FrameRules | None = None,
+        labels: Mapping[int, Label] | None = None,
+    ) -> None:
+        self._source, self._success, self._rules = source, success, rules
+        self._labels = labels or {}
+        there = {entry.index for entry in source.episodes} if self._labels else set[int]()
+        strange = self._labels.keys() - there
+        if strange:
+            raise BadValue(
+                f"there are labels of episode {min(strange)}, but '{source.root}' has "
+                f"{say_count(len(there), 'episode')}"
+            )
+        self.names = list(rules.names) if rules else []
+        marked = [name for each in self._labels.values() for name, _ in each.subtasks]
+        if marked:
+            self.names = [*dict.fromkeys(marked)]
+            self.names += [] if OTHER in self.names else [OTHER]
+        self._labels_success = success is not None or any(
+            each.success is not None for each in self._labels.values()
+        )
+        self.features = {
+            key: FEATURES[key]
+            for key, is_labelled in ((SUCCESS, self._labels_success), (SUBTASK, self.names))
+            if is_labelled and key not in source.features
+        }
+        self._counts = {True: 0, False: 0, None: 0}
+        self._changed: list[int] = []
+        self._frames: dict[str, int] = dict.fromkeys(self.names, 0)
+
+    def make_clips(self, *, quiet: bool = True) -> Generator[Clip]:
+        """Make every episode with its labels."""
+        from xop_lerobot.curate.clip import Clip  # noqa: PLC0415
+
+        source = self._source
+        pairs = self._judge()
+        for entry, success in show_progress(pairs, source.total_episodes, "episode", quiet=quiet):
+            columns: dict[str, np.ndarray] = {}
+            facts: dict[str, Any] = {}
+            if self._labels_success:
+                self._label_success(entry, success, columns, facts)
+            if self.names:
+                numbers = self._number(entry)
+                columns[SUBTASK] = numbers[:, None]
+                facts["subtasks"] = list_runs(numbers, self.names)
+                for number, count in zip(*np.unique(numbers, return_counts=True), strict=True):
+                    self._frames[self.names[number]] += int(count)
+            yield Clip(source, entry, facts=facts, columns=columns)
+
+    def _judge(self) -> Generator[tuple[EpisodeEntry, bool | None]]:
+        if self._success is None:
+            for entry in self._source.episodes:
+                yield entry, self._labels.get(entry.index, Label()).success
+            return
+        from xop_lerobot.curate.survey import survey  # noqa: PLC0415 SciPy, MuJoCo
+
+        for finding in survey(self._source, self._success.names):
+            yield finding.entry, self._success.evaluate(finding.figures)
+
+    def _label_success(
+        self,
+        entry: EpisodeEntry,
+        success: bool | None,
+        columns: dict[str, np.ndarray],
+        facts: dict[str, Any],
+    ) -> None:
+        self._counts[success] += 1
+        has_column = SUCCESS in self._source.features
+        column = self._source.read(entry, [SUCCESS])[SUCCESS] if has_column else None
+        before = entry.facts.get("success", None if column is None else bool(column[-1, 0]))
+        if success is None:
+            if column is None:
+                columns[SUCCESS] = np.zeros((entry.length, 1), bool)
+            return
+        columns[SUCCESS] = set_success(column, entry.length, success)
+        facts["success"] = success
+        if before != success:
+            self._changed.append(entry.index)
+
+    def _number(self, entry: EpisodeEntry) -> np.ndarray:
+        if self._rules is not None:
+            return self._rules.find(entry)
+        label = self._labels.get(entry.index, Label())
+        rest = self.names.index(OTHER)
+        return number_frames(label, self.names, entry.length, self._source.fps, rest)
+
+    def report(self) -> None:
+        """Print what was labelled."""
+        if self._labels_success:
+            counts = self._counts
+            print(
+                f"success: {counts[True]} yes, {counts[False]} no, {counts[None]} as before; "
+                f"changed: {', '.join(map(str, self._changed)) or 'none'}"
+            )
+        if self.names:
+            fps = self._source.fps
+            times = (f"{name} {count / fps:.2f} s" for name, count in self._frames.items())
+            print(f"sub-tasks: {', '.join(times)}")
+
+
+def ask(source: Source, path: Path, names: list[str], view: str = "auto") -> dict[int, Label]:
+    """Ask somebody for labels.
+
+    Args:
+        source: The dataset.
+        path: File of the answers.
+        names: Names of the sub-tasks.
+        view: `window`, `terminal` or `auto`.
+    """
+    from xop_lerobot.curate import label_views  # noqa: PLC0415 matplotlib
+    from xop_lerobot.curate.label_session import LabelSession  # noqa: PLC0415
+
+    entries = {entry.index: entry for entry in source.episodes}
+    session = LabelSession(sorted(entries), path, names)
+    if view == "window" or (view == "auto" and label_views.has_display()):
+        window = label_views.LabelWindow(
+            session, lambda index: label_views.read_films(source, entries[index]), source.fps
+        )
+        window.run()
+        return session.labels
+    folder = path.with_name(f"{path.stem}_strips")
+    label_views.ask_in_terminal(
+        session,
+        lambda index: label_views.read_films(source, entries[index], _STRIP),
+        folder,
+        lambda index: _STRIP / (entries[index].length / source.fps),
+    )
+    return session.labels

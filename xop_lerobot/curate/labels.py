@@ -1,0 +1,103 @@
+"""Labels of episodes: whether they succeeded, and which sub-task began when."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from xop_lerobot.collect.folder import write_whole
+from xop_lerobot.core.errors import BadValue
+
+
+@dataclass(frozen=True)
+class Label:
+    """What is said of an episode.
+
+    Attributes:
+        success: Whether it succeeded; None leaves that as it is.
+        subtasks: Sub-tasks and when each begins [s], in their order.
+    """
+
+    success: bool | None = None
+    subtasks: tuple[tuple[str, float], ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the label as plain values."""
+        return {"success": self.success, "subtasks": [list(each) for each in self.subtasks]}
+
+
+def read_labels(path: Path) -> dict[int, Label]:
+    """Read labels by episode from a JSON file; empty if there is none.
+
+    Raises:
+        BadValue: If it is malformed; says where.
+    """
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise BadValue(f"labels '{path}' are not readable ({error})") from error
+    if not isinstance(rows, dict):
+        raise BadValue(f"labels '{path}' must be one JSON object by episode")
+    labels = {}
+    for key, row in rows.items():
+        try:
+            success = row.get("success")
+            if success not in (None, True, False):
+                raise ValueError("success")
+            pairs = [(str(name), float(start)) for name, start in row.get("subtasks", ())]
+            labels[int(key)] = Label(success, tuple(sorted(pairs, key=lambda pair: pair[1])))
+        except (AttributeError, TypeError, ValueError) as error:
+            raise BadValue(
+                f"labels '{path}': episode {key} must have success (true, false or null) and "
+                f"subtasks ([[name, start in s], …]), got {row}"
+            ) from error
+    return labels
+
+
+def write_labels(path: Path, labels: Mapping[int, Label]) -> None:
+    """Write labels; the file is there as a whole or as it was."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, {str(index): labels[index].to_json() for index in sorted(labels)})
+
+
+def number_frames(
+    label: Label, names: Sequence[str], length: int, fps: float, rest: int
+) -> np.ndarray:
+    """Number the sub-task of each frame; `rest` before the first begins. Shape (n,)."""
+    numbers = np.full(length, rest)
+    for name, start in label.subtasks:
+        numbers[max(0, round(start * fps)) :] = names.index(name)
+    return numbers
+
+
+def list_runs(numbers: np.ndarray, names: Sequence[str]) -> list[dict[str, Any]]:
+    """List which sub-task goes from which frame to before which."""
+    edges = np.flatnonzero(np.diff(numbers)) + 1
+    starts, stops = [0, *edges.tolist()], [*edges.tolist(), len(numbers)]
+    return [
+        {"name": names[int(numbers[start])], "start": start, "stop": stop}
+        for start, stop in zip(starts, stops, strict=True)
+    ]
+
+
+def set_success(column: np.ndarray | None, length: int, success: bool) -> np.ndarray:
+    """Bring `next.success` in line with a label: true in the last frame, or nowhere.
+
+    Args:
+        column: What it was; None where there was none. Shape (n, 1).
+        length: Frames.
+        success: The label.
+    """
+    values = np.zeros((length, 1), bool) if column is None else column.astype(bool).copy()
+    if success:
+        values[-1] = True
+    else:
+        values[:] = False
+    return values

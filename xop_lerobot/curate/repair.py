@@ -1,0 +1,82 @@
+"""Restore a recording that was cut off, to its last whole episode.
+
+A recorder that is killed, or a disk that is full, leaves files without their end and metadata that
+is missing or does not fit. Every episode of which all rows and pictures are there is kept; what is
+lost is said, with the reason. Nothing is guessed: rows that were not written yet are gone.
+
+    xop-curate repair --root outputs/killed --out outputs/restored
+
+Recordings of `xop-record`, and those of `lerobot-record` with this project's robots, load after a
+kill as they are; this cleans up behind them. Those of LeRobot's own robots do not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.wording import say_count
+from xop_lerobot.curate.arguments import (
+    add_destination,
+    add_source,
+    make_destination,
+    show_progress,
+)
+
+if TYPE_CHECKING:
+    from xop_lerobot.curate.clip import Clip
+    from xop_lerobot.curate.wreck import Wreck
+
+SUMMARY = "restore a recording that was cut off"
+
+
+def add_arguments(parser: CommandParser) -> None:
+    """Add the verb's flags."""
+    add_source(parser)
+    add_destination(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Repair a dataset; returns the exit code."""
+    from xop_lerobot.curate.transfer import Step, transfer  # noqa: PLC0415 torch
+    from xop_lerobot.curate.wreck import lay_out  # noqa: PLC0415 torch
+
+    root: Path = arguments.root
+    destination = make_destination(arguments, root)
+    if destination is None:
+        with tempfile.TemporaryDirectory() as folder:
+            report(lay_out(root, Path(folder) / "wreck"))
+        return 0
+    with destination as draft:
+        wreck = lay_out(root, draft.with_name("wreck"))
+        report(wreck)
+        step = dataclasses.replace(Step.now("repair"), root=root)
+        transfer(_make_clips(wreck, quiet=arguments.quiet), draft, step)
+    print(f"written to {destination.root}")
+    return 0
+
+
+def _make_clips(wreck: Wreck, *, quiet: bool) -> Iterator[Clip]:
+    from xop_lerobot.curate.clip import Clip  # noqa: PLC0415
+
+    total = len(wreck.entries)
+    for entry in show_progress(wreck.entries, total, "episode", quiet=quiet):
+        yield Clip(wreck.source, entry)
+
+
+def report(wreck: Wreck) -> None:
+    """Print what was found, what is kept and what is lost."""
+    for note in wreck.notes:
+        print(note)
+    for index, reason in sorted(wreck.lost.items()):
+        print(f"episode {index} is lost: {reason}")
+    if not wreck.notes and not wreck.lost:
+        print("nothing is wrong with it")
+    frames = sum(entry.length for entry in wreck.entries)
+    whole = f"{say_count(len(wreck.entries), 'episode')}, {say_count(frames, 'frame')}"
+    print(f"whole: {whole}. Lost: {len(wreck.lost)}")

@@ -1,0 +1,168 @@
+"""Goes through a dataset and tells the figures of each episode, one episode at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from xop_lerobot.core.errors import BadDataset, XopError
+from xop_lerobot.curate.expression import Kind
+from xop_lerobot.curate.figures import FIGURES, KINDS
+from xop_lerobot.curate.measures import MEASURES, Episode, Measure
+from xop_lerobot.curate.order_check import OrderCheck
+from xop_lerobot.curate.source import EpisodeEntry, Source
+from xop_lerobot.curate.video_check import VideoCheck
+
+_FACTS = {
+    name: name
+    for name in (
+        "finished", "late", "dropped_frames", "real_fps", "clock", "scene", "low_level", "seed",
+        "start_time", "collision",
+    )
+}  # fmt: skip
+"""Figures that are facts, and the facts that they are."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is known of an episode.
+
+    Attributes:
+        entry: What the metadata says.
+        figures: The figures that were asked for by name, in the order of `FIGURES`; None for what
+            is not known.
+        problems: What could not be read, or is not as the metadata says.
+    """
+
+    entry: EpisodeEntry
+    figures: Mapping[str, Any]
+    problems: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures and the problems as plain values."""
+        return {**self.figures, "problems": list(self.problems)}
+
+
+def survey(
+    source: Source,
+    names: Collection[str] = tuple(FIGURES),
+    note: Callable[[str], None] | None = None,
+    episodes: Collection[int] | None = None,
+) -> Iterator[Finding]:
+    """Find the figures of each episode in order; what is not asked for is not read.
+
+    Rows that cannot be read are no error: the figures of them are None, and `problems` says why.
+
+    Args:
+        source: The dataset.
+        names: Names of the figures.
+        note: Told of files of metadata that cannot be read; None makes them an error.
+        episodes: Indices of the episodes; all if None.
+
+    Raises:
+        BadDataset: If the metadata is missing or malformed.
+    """
+    wanted = [name for name in FIGURES if name in names]
+    measures = [each for each in MEASURES if not set(wanted).isdisjoint(each.figures)]
+    videos = order = None
+    if "readable" in names:
+        videos, order = VideoCheck(source), OrderCheck(source)
+    for entry in source.iterate(note):
+        if episodes is not None and entry.index not in episodes:
+            if order is not None:
+                order.check(entry, None)
+            continue
+        problems = list(entry.faults)
+        values = _read_facts(source, entry)
+        more = None if order is None else order.columns
+        measured, rows = _measure(source, entry, measures, problems, more)
+        values |= measured
+        if videos is not None and order is not None:
+            problems += videos.check(entry) if entry.has_rows else ()
+            values["readable"] = not problems
+            problems += order.check(entry, rows)
+        figures = {name: _clean(values.get(name), name, problems) for name in wanted}
+        yield Finding(entry, figures, tuple(dict.fromkeys(problems)))
+
+
+def _read_facts(source: Source, entry: EpisodeEntry) -> dict[str, Any]:
+    facts = entry.facts
+    settings = facts.get("settings")
+    return {
+        "episode": entry.index,
+        "length": entry.length,
+        "duration": entry.length / source.fps,
+        "robot": facts.get("robot", source.robot),
+        "task": " | ".join(entry.tasks) or facts.get("task"),
+        "preset": settings.get("preset") if isinstance(settings, Mapping) else None,
+        **{name: facts.get(fact) for name, fact in _FACTS.items()},
+    }
+
+
+def _measure(
+    source: Source,
+    entry: EpisodeEntry,
+    measures: list[Measure],
+    problems: list[str],
+    more: tuple[str, ...] | None,
+) -> tuple[dict[str, Any], Mapping[str, np.ndarray] | None]:
+    """Compute figures; `more` are columns to be read too, of rows that are to be checked.
+
+    Returns:
+        The figures, and the columns; None if one of them cannot be read.
+    """
+    columns = {each: each.find_columns(source.features, entry) for each in measures}
+    able = {each: names for each, names in columns.items() if names is not None}
+    together = tuple(
+        dict.fromkeys((*(name for names in able.values() for name in names), *(more or ())))
+    )
+    rows: Mapping[str, np.ndarray] | None = None
+    try:
+        if more is not None:
+            source.check_rows(entry)
+    except BadDataset as error:
+        problems.append(error.fault)
+    try:
+        rows = source.read(entry, together) if together else {}
+    except BadDataset as error:
+        problems.append(error.fault)
+    values: dict[str, Any] = {}
+    for measure, names in able.items():
+        try:
+            # If one column is bad, the figures of the others are found all the same.
+            held = source.read(entry, names) if rows is None and names else rows or {}
+            values |= _compute(source, entry, measure, {name: held[name] for name in names})
+        except BadDataset as error:
+            problems.append(error.fault)
+        except XopError as error:
+            problems.append(f"episode {entry.index}: {error}")
+    return values, rows
+
+
+def _compute(
+    source: Source, entry: EpisodeEntry, measure: Measure, rows: Mapping[str, np.ndarray]
+) -> Mapping[str, Any]:
+    robot = entry.facts.get("robot", source.robot)
+    robot = robot if isinstance(robot, str) else None
+    with np.errstate(all="ignore"):  # what is not finite is not known, see `_clean`
+        return measure.compute(Episode(entry, source.features, rows, 1 / source.fps, robot))
+
+
+def _clean(value: Any, name: str, problems: list[str]) -> Any:
+    """Return `value` if it is of the figure's kind and finite, else None."""
+    if value is None:
+        return None
+    kind = KINDS[name]
+    is_flag = isinstance(value, bool)
+    if kind is Kind.FLAG and is_flag:
+        return value
+    if kind is Kind.TEXT and isinstance(value, str):
+        return value
+    if kind is Kind.NUMBER and not is_flag and isinstance(value, int | float):
+        return value if math.isfinite(value) else None
+    problems.append(f"'{name}' must be {kind.value}, the metadata says {value!r}")
+    return None

@@ -1,0 +1,278 @@
+"""Pictures of episodes, taken from video files as they are: nothing is encoded anew.
+
+A video can be cut only before a picture that is complete in itself (a key frame), but an episode
+of LeRobot's may begin anywhere in its file: its metadata says at which time. So a cut keeps the
+whole groups of pictures that the episode needs, and the times are exact. With LeRobot's own setting
+(a key frame every second picture) a single picture too much stays at each end.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.error import FFmpegError
+
+from xop_lerobot.core.errors import BadDataset
+from xop_lerobot.curate.packets import find_framing
+
+
+@dataclass(frozen=True)
+class VideoIndex:
+    """Where the pictures of a video lie, in the order in which they are decoded.
+
+    Attributes:
+        pts: When each is shown, in units of `time_base`. Shape (n,).
+        keys: Whether each is a key frame. Shape (n,), bool.
+        time_base: Unit of the times [s].
+        damaged: Which of them are damaged, as far as their framing tells. Shape (m,).
+    """
+
+    pts: np.ndarray
+    keys: np.ndarray
+    time_base: Fraction
+    damaged: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    @property
+    def times(self) -> np.ndarray:
+        """When each picture is shown [s]. Shape (n,)."""
+        return self.pts * float(self.time_base)
+
+    def count_missing(self, start: float, length: int, fps: float) -> int:
+        """Count those of `length` frames from `start` [s] on at which no picture is shown."""
+        wanted = start + np.arange(length) / fps
+        times = np.concatenate([[-np.inf], np.sort(self.times), [np.inf]])
+        after = np.searchsorted(times, wanted)
+        near = np.minimum(wanted - times[after - 1], times[after] - wanted)
+        return int((near > 0.25 / fps).sum())
+
+    def count_damaged(self, start: float, stop: float, fps: float) -> int:
+        """Count the pictures from `start` to `stop` [s] that are damaged, or are made from such.
+
+        What comes after a damaged picture is made from it, until the next key frame.
+        """
+        spoiled = np.zeros(len(self.pts), bool)
+        keys = np.append(np.flatnonzero(self.keys), len(self.pts))
+        for packet in self.damaged:
+            spoiled[packet : keys[np.searchsorted(keys, packet, side="right")]] = True
+        half, times = 0.5 / fps, self.times
+        return int((spoiled & (times > start - half) & (times < stop - half)).sum())
+
+    def find_groups(self, start: float, stop: float, fps: float) -> tuple[int, int] | None:
+        """Find the whole groups that hold what is shown from `start` to `stop` [s].
+
+        Returns:
+            The first packet, and the one after the last; None if nothing is shown then.
+        """
+        half = 0.5 / fps
+        shown = np.flatnonzero((self.times > start - half) & (self.times < stop - half))
+        if not shown.size:
+            return None
+        keys = np.flatnonzero(self.keys)
+        before = keys[(keys <= shown[0]) & (self.times[keys] < start + half)]
+        after = keys[keys > shown.max()]
+        first = int(before[-1]) if before.size else 0
+        return first, int(after[0]) if after.size else len(self.pts)
+
+
+def index_video(root: Path, file: Path) -> VideoIndex:
+    """Index the pictures of `root / file` without decoding them, and look at their framing.
+
+    Raises:
+        BadDataset: If there is no such file, or it is no video.
+    """
+    pts, keys, damaged, time_base = [], [], [], Fraction(1, 1)
+    try:
+        size = (root / file).stat().st_size
+        with av.open(str(root / file)) as container:
+            stream = container.streams.video[0]
+            codec = stream.codec_context
+            is_whole = find_framing(codec.codec.canonical_name, codec.extradata)
+            for packet in container.demux(stream):
+                if packet.pts is None or packet.dts is None:
+                    continue
+                # The file may be cut off in it, which the decoder's library does not always tell.
+                if packet.is_corrupt or (packet.pos or 0) + packet.size > size:
+                    break
+                if is_whole is not None and not is_whole(bytes(packet)):
+                    damaged.append(len(pts))
+                pts.append(packet.pts)
+                keys.append(packet.is_keyframe)
+            time_base = stream.time_base or Fraction(1, 1)
+    except FileNotFoundError:
+        raise BadDataset(root, f"{file} is missing") from None
+    except (FFmpegError, OSError, IndexError, ValueError) as error:
+        raise BadDataset(root, f"{file} is not readable ({_say(error)})") from error
+    places = np.array(damaged, np.int64)
+    return VideoIndex(np.array(pts, np.int64), np.array(keys, bool), time_base, places)
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A time span of a video.
+
+    Attributes:
+        root: Directory of the dataset.
+        file: The video, relative to it.
+        start: Time of the first picture [s].
+        stop: Time of the end of the last [s].
+        length: How many pictures should be in it; None where that is not known.
+        spare: How many of them may be missing, because the encoder dropped them.
+    """
+
+    root: Path
+    file: Path
+    start: float
+    stop: float
+    length: int | None = None
+    spare: int = 0
+
+    def check(self, index: VideoIndex, fps: float) -> None:
+        """Check that all its pictures are there and whole.
+
+        Raises:
+            BadDataset: If not.
+        """
+        damaged = index.count_damaged(self.start, self.stop, fps)
+        if damaged:
+            raise BadDataset(
+                self.root,
+                f"{self.file} is damaged: {damaged} pictures from {self.start:.3f} s to "
+                f"{self.stop:.3f} s. `xop-curate repair` keeps the other episodes",
+            )
+        missing = index.count_missing(self.start, self.length or 0, fps)
+        if missing > self.spare:
+            raise BadDataset(
+                self.root,
+                f"{self.file} lacks {missing} of the {self.length} pictures from "
+                f"{self.start:.3f} s on, at {fps:g} Hz. `xop-curate repair` keeps what is whole",
+            )
+
+
+class VideoFile:
+    """A new video, made of spans of another, one after another.
+
+    Args:
+        path: Where it is written.
+        fps: Pictures a second [Hz].
+    """
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self.path, self._fps = path, fps
+        self._container: Any = None
+        self._stream: Any = None
+        self._end = 0  # in the source's units
+        self._last_dts: int | None = None
+        path.parent.mkdir(parents=True, exist_ok=True)
+
+    def add(self, cut: Cut, index: VideoIndex) -> tuple[float, float]:
+        """Add a span of a video.
+
+        Args:
+            cut: The span.
+            index: Index of its video, which is the same for all spans.
+
+        Returns:
+            Start and stop of the span in this file [s].
+
+        Raises:
+            BadDataset: If nothing is shown then.
+        """
+        groups = index.find_groups(cut.start, cut.stop, self._fps)
+        if groups is None:
+            raise BadDataset(
+                cut.root, f"{cut.file} shows nothing from {cut.start:.3f} s to {cut.stop:.3f} s"
+            )
+        first, last = groups
+        pts = index.pts[first:last]
+        lowest = index.pts[first]
+        shift = self._end - int(lowest)
+        self._copy(cut, index, first, last, shift)
+        step = round(1 / (self._fps * index.time_base))
+        self._end = int(pts.max()) + shift + step
+        offset = shift * float(index.time_base)
+        return cut.start + offset, cut.stop + offset
+
+    def _copy(self, cut: Cut, index: VideoIndex, first: int, last: int, shift: int) -> None:
+        with av.open(str(cut.root / cut.file)) as container:
+            stream = container.streams.video[0]
+            if self._container is None:
+                self._container = av.open(
+                    str(self.path), mode="w", options={"movflags": "faststart"}
+                )
+                self._stream = self._container.add_stream_from_template(stream, opaque=True)
+                self._stream.time_base = stream.time_base
+            lowest, count = index.pts[first], -1
+            for packet in container.demux(stream):
+                if packet.pts is None or packet.dts is None:
+                    continue
+                count += 1
+                if count >= last:
+                    break
+                # What a key frame's group shows before it belongs to the group before, too.
+                if count < first or packet.pts < lowest:
+                    continue
+                packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
+                if self._last_dts is not None and packet.dts <= self._last_dts:
+                    packet.dts = self._last_dts + 1
+                self._last_dts = packet.dts
+                packet.stream = self._stream
+                self._container.mux(packet)
+
+    def close(self) -> None:
+        """Finish the file; may be called twice."""
+        if self._container is not None:
+            self._container.close()
+            self._container = None
+
+
+def copy_whole(cut: Cut, index: VideoIndex, path: Path, fps: float) -> bool:
+    """Copy a video to `path` byte by byte if the span is all of it; tell whether it was."""
+    if index.find_groups(cut.start, cut.stop, fps) != (0, len(index.pts)):
+        return False
+    times = index.times
+    if times.min() < cut.start - 0.5 / fps or times.max() > cut.stop - 0.5 / fps:
+        return False
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(cut.root / cut.file, path)
+    return True
+
+
+def decode(cut: Cut, fps: float, wanted: set[int]) -> Iterator[tuple[int, np.ndarray]]:
+    """Decode pictures of a span, those numbered `wanted` from its start on.
+
+    Yields:
+        The number of each, and the picture. Shape (height, width, 3), uint8.
+
+    Raises:
+        BadDataset: If the video is not readable.
+    """
+    half, left = 0.5 / fps, set(wanted)
+    try:
+        with av.open(str(cut.root / cut.file)) as container:
+            stream = container.streams.video[0]
+            unit = float(stream.time_base or 1)
+            container.seek(int(max(cut.start - half, 0) / unit), stream=stream, backward=True)
+            for frame in container.decode(stream):
+                if frame.pts is None:
+                    continue
+                time = frame.pts * unit - cut.start
+                number = round(time * fps)
+                if time > -half and number in left:
+                    left.discard(number)
+                    yield number, frame.to_ndarray(format="rgb24")
+                if not left or time > cut.stop - cut.start:
+                    return
+    except (FFmpegError, OSError, IndexError) as error:
+        raise BadDataset(cut.root, f"{cut.file} is not readable ({_say(error)})") from error
+
+
+def _say(error: Exception) -> str:
+    """Say what is wrong, without number and path."""
+    return getattr(error, "strerror", None) or str(error)

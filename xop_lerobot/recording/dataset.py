@@ -1,0 +1,560 @@
+"""A LeRobot dataset with the columns, episode hooks and durability of this project.
+
+`XopDataset` is `LeRobotDataset` in every respect that LeRobot's loops see: while it records,
+`features` shows LeRobot's own columns alone. What it adds comes from the session in which robot
+and teleoperator meet (`xop_lerobot.link`), so the loops need not know of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import shutil
+import time
+from collections.abc import Iterator, Mapping, MutableMapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar, Self, cast
+
+import numpy as np
+from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import HF_LEROBOT_HOME
+
+from xop_lerobot.core.errors import BadDataset, BadValue, XopError
+from xop_lerobot.core.shutdown import hold_signals
+from xop_lerobot.core.state import RobotState
+from xop_lerobot.core.versions import read_versions
+from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
+from xop_lerobot.operator.display import Cue, Progress, Wish
+from xop_lerobot.recording import durability
+from xop_lerobot.recording.columns import Columns, has_all_columns, is_own_column
+from xop_lerobot.recording.embedding import skip_embedding
+from xop_lerobot.recording.executed import put_executed
+from xop_lerobot.recording.facts import (
+    FACT_COLUMNS,
+    FACTS_PREFIX,
+    EpisodeFacts,
+    append_facts,
+    compute_config_hash,
+    keep_config,
+    to_plain,
+)
+from xop_lerobot.recording.requests import grant
+from xop_lerobot.recording.resume import check_resumable
+from xop_lerobot.recording.rollback import (
+    Checkpoint,
+    NotSaved,
+    abandon_writers,
+    check_pictures,
+    find_reason,
+)
+from xop_lerobot.recording.schedule import keep_schedule
+from xop_lerobot.recording.tally import Tally
+from xop_lerobot.recording.video_queue import VideoQueue
+
+logger = logging.getLogger(__name__)
+
+_LATE = 0.95
+"""Share of its rate under which a real-time episode is marked as late."""
+
+
+class DatasetExists(XopError, FileExistsError):
+    """The directory of a new dataset is there already."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(
+            f"dataset directory '{root}' exists already. Choose another --dataset.root, delete "
+            "it, or add episodes to it with --resume=true"
+        )
+
+
+class NotMade(XopError):
+    """The directory of a new dataset cannot be made."""
+
+    def __init__(self, root: Path, reason: str) -> None:
+        super().__init__(f"dataset directory '{root}' cannot be made: {reason}")
+
+
+class WrongFps(XopError, ValueError):
+    """Robot and dataset run at different rates."""
+
+    def __init__(self, robot_fps: int, dataset_fps: int) -> None:
+        super().__init__(
+            f"the robot runs at {robot_fps} Hz (--robot.fps) and the dataset at {dataset_fps} Hz "
+            f"(--dataset.fps); they must be equal. Use --dataset.fps={robot_fps}"
+        )
+
+
+class BatchedEncoding(XopError, ValueError):
+    """Videos should be encoded later than their episodes are saved."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__(
+            f"--dataset.video_encoding_batch_size must be 1, got {size}: an episode is saved with "
+            "its videos, so that what happens later can't take them. To save sooner, use "
+            "--dataset.streaming_encoding=true"
+        )
+
+
+class XopDataset(LeRobotDataset):
+    """LeRobotDataset plus operator, goal, retargeter and robot columns.
+
+    Attributes:
+        session_name: Session whose robot and teleoperator are recorded.
+        extra_columns: Whether to record the columns of `xop_lerobot.recording.columns`.
+        more_facts: Facts on the next episode that only who records it knows, fit for JSON.
+    """
+
+    session_name: ClassVar[str] = "default"
+    extra_columns: ClassVar[bool] = True
+    more_facts: Mapping[str, Any] = MappingProxyType({})
+
+    _session: Session
+    _info: RobotInfo
+    _columns: Columns | None
+    _config: dict[str, Any]
+    _config_hash: str
+    _keep_facts: bool
+    _own_root: bool
+    _create_options: dict[str, Any]
+
+    @classmethod
+    def bind(cls, session: str, *, extra_columns: bool = True) -> type[Self]:
+        """Return this class for the session `session`."""
+        names = {"session_name": session, "extra_columns": extra_columns}
+        bound = type(cls.__name__, (cls,), {**names, "__doc__": cls.__doc__})
+        return cast("type[Self]", bound)
+
+    @classmethod
+    def create(  # pyright: ignore[reportIncompatibleMethodOverride]
+        cls, repo_id: str, fps: int, features: dict, root: str | Path | None = None, **options: Any
+    ) -> Self:
+        """Create a dataset; see `LeRobotDataset.create` for the arguments.
+
+        Raises:
+            LinkError: If the session has no robot, or more than one.
+            WrongFps: If the robot runs at another rate.
+            BatchedEncoding: If videos should be encoded later than their episodes are saved.
+            DatasetExists: If the directory is there already.
+            NotMade: If the system does not let it be made.
+        """
+        info = get_session(cls.session_name).robot
+        _check_encoding(options)
+        if fps != info.fps:
+            raise WrongFps(info.fps, fps)
+        folder = Path(root) if root else HF_LEROBOT_HOME / repo_id
+        if folder.exists():
+            raise DatasetExists(folder)
+        columns = Columns(info) if cls.extra_columns else None
+        features = {**features, **(columns.features if columns else {})}
+        try:
+            dataset = cast("Self", super().create(repo_id, fps, features, root=root, **options))
+        except FileExistsError as error:  # somebody else was faster
+            raise DatasetExists(folder) from error
+        except OSError as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise NotMade(folder, find_reason(error)) from error
+        dataset._begin_session(info, columns, options)
+        dataset._own_root = True
+        return dataset
+
+    @classmethod
+    def resume(  # pyright: ignore[reportIncompatibleMethodOverride]
+        cls, repo_id: str, root: str | Path | None = None, **options: Any
+    ) -> Self:
+        """Add to a dataset; see `LeRobotDataset.resume` for the arguments.
+
+        A dataset that was recorded without this project's columns stays without them.
+
+        Raises:
+            LinkError: If the session has no robot, or more than one.
+            BatchedEncoding: If videos should be encoded later than their episodes are saved.
+            BadDataset: If there is no dataset, or it cannot be read.
+            NotResumable: If it is of another robot, or of other cameras or sizes of pictures.
+            WrongFps: If the robot runs at another rate.
+            BadValue: If its columns are those of another version.
+        """
+        info = get_session(cls.session_name).robot
+        _check_encoding(options)
+        dataset = cls._open(repo_id, root, options)
+        try:
+            columns = dataset._check_fit(info)
+        except BaseException:
+            LeRobotDataset.finalize(dataset)
+            raise
+        if columns is None and cls.extra_columns:
+            logger.warning(
+                "'%s' was recorded without the operator's columns; new episodes have none either.",
+                dataset.root,
+            )
+        dataset._begin_session(info, columns, options)
+        episodes = dataset.meta.episodes
+        if episodes is not None and len(episodes) > 0:
+            dataset._keep_facts = set(FACT_COLUMNS) <= set(episodes.column_names)
+        return dataset
+
+    @classmethod
+    def _open(cls, repo_id: str, root: str | Path | None, options: dict[str, Any]) -> Self:
+        """Open a dataset to add to it; see `resume`."""
+        if not root:
+            raise BadValue("--resume=true needs --dataset.root, the directory of the dataset")
+        folder = Path(root)
+        existed = folder.exists()
+        try:
+            return cast("Self", super().resume(repo_id, root=root, **options))
+        except Exception as error:  # of JSON, parquet or the Hub, whatever is wrong with the files
+            first = (str(error).splitlines() or [""])[0]
+            fault = f"it cannot be read ({type(error).__name__}: {first}). "
+            if (folder / "meta" / "info.json").exists():
+                fault += f"`xop-curate repair --root {folder} --out DIR` makes a whole one of it"
+            else:
+                fault = (
+                    f"there is none to add to, nor is '{repo_id}' on the Hub or within reach. "
+                    "Leave --resume out to begin it"
+                )
+            if not existed:
+                with suppress(OSError):
+                    folder.rmdir()  # LeRobot makes it
+            raise BadDataset(folder, fault) from error
+
+    def _check_fit(self, info: RobotInfo) -> Columns | None:
+        """Check that the robot's episodes fit; return our columns, None if there are none."""
+        if self.fps != info.fps:
+            raise WrongFps(info.fps, self.fps)
+        columns, features = Columns(info), self.meta.features
+        check_resumable(self.root, self.meta.robot_type, features, info, columns.features)
+        return columns if has_all_columns(features, columns, self.root) else None
+
+    def _begin_session(
+        self, info: RobotInfo, columns: Columns | None, options: dict[str, Any]
+    ) -> None:
+        self._session = get_session(self.session_name)
+        self._info, self._columns = info, columns
+        self._create_options = options
+        self._keep_facts, self._own_root = True, False
+        self._tally = Tally()
+        self._tick_limit: int | None = None
+        self._stop_on_success = self._paused = False
+        self._events: MutableMapping[str, bool] = {}
+        self._last_state: RobotState | None = None
+        # Written with the first episode: a session that records none changes nothing.
+        self._config = to_plain(self._session.configs)
+        self._config_hash = compute_config_hash(self._config)
+        self._attach_writer()
+        self._session.begin_episode(self.num_episodes)
+
+    def _attach_writer(self) -> None:
+        self._video = VideoQueue(getattr(self.writer, "_streaming_encoder", None), self.writer)
+        stock = self.meta.save_episode
+
+        def save_with_facts(
+            episode_index: int,
+            episode_length: int,
+            episode_tasks: list[str],
+            episode_stats: dict[str, dict],
+            episode_metadata: dict,
+        ) -> None:
+            """Save an episode's metadata, with what is known of it as a whole."""
+            if self._keep_facts:
+                episode_metadata = {**episode_metadata, **self._collect_facts().to_metadata()}
+                for key, value in self.more_facts.items():
+                    episode_metadata[FACTS_PREFIX + key] = json.dumps(value)
+            stock(episode_index, episode_length, episode_tasks, episode_stats, episode_metadata)
+
+        # An instance attribute, so that other datasets of the process are untouched.
+        self.meta.save_episode = save_with_facts
+
+    def __bool__(self) -> bool:
+        """True even while it is empty: `lerobot-record` finalizes its dataset `if dataset`."""
+        return True
+
+    # The episode, as LeRobot's loops drive it.
+
+    @property
+    def features(self) -> dict[str, dict]:
+        """All columns; while recording, only those that LeRobot's loops fill."""
+        features = self.meta.features
+        if self.writer is None or self._is_finalized:
+            return features
+        return {key: value for key, value in features.items() if not is_own_column(key)}
+
+    def begin(
+        self,
+        events: MutableMapping[str, bool],
+        tick_limit: int | None,
+        *,
+        stop_on_success: bool = False,
+    ) -> None:
+        """Say how the episode that begins now ends.
+
+        Args:
+            events: The loop's events; `exit_early` is set when the episode is over.
+            tick_limit: Frames after which it is over, None to leave that to the loop.
+            stop_on_success: Whether it is over as soon as the task is accomplished.
+        """
+        self._events, self._tick_limit = events, tick_limit
+        self._stop_on_success, self._paused = stop_on_success, False
+        self._session.recorder = self
+        self.forget_presses()
+
+    def forget_presses(self) -> None:
+        """Forget keys that were pressed while the last episode was saved or the robot started over.
+
+        Saving takes a second in which nothing seems to happen, so people press again; what they
+        mean is the episode that they have seen. Only Esc still counts: it ends the session, and
+        an episode without a frame is left out.
+        """
+        if self._tally.frames or not self._events:
+            return
+        stops = self._events.get("stop_recording", False)
+        self._events["exit_early"] = self._events["rerecord_episode"] = stops
+
+    def pause(self, events: MutableMapping[str, bool]) -> None:
+        """Say that the pause after an episode begins, in which that can still be discarded."""
+        self._events, self._paused = events, True
+        progress = self._session.progress
+        if progress is not None:
+            self._session.progress = dataclasses.replace(progress, paused=True)
+
+    def grant(self, wish: Wish) -> tuple[Cue, str]:
+        """Do with the episode what the operator asks for; return what to tell the operator."""
+        state = self._session.state
+        time = 0.0 if state is None else state.time
+        told = grant(wish, self._events, self._tally, paused=self._paused, time=time)
+        progress = self._session.progress
+        if progress is not None:
+            self._session.progress = dataclasses.replace(progress, success=self._tally.success)
+        return told
+
+    def add_frame(self, frame: dict) -> None:
+        """Add a frame with this tick's extra columns, and the action that the robot executes.
+
+        Raises:
+            BadValue: If the frame is of an earlier tick, whose columns nobody knows any more.
+            NotSaved: If it cannot be written; a full disk is the usual reason.
+        """
+        session, tally = self._session, self._tally
+        state, outcome = session.state, session.outcome
+        tick = self._current_tick()
+        frame = put_executed(frame, session.executed, self.meta.features)
+        if self._columns is not None and state is not None:
+            if state is self._last_state:
+                raise BadValue(
+                    "a frame came late: another one of the same tick is recorded already. "
+                    "--strategy.type=highlight keeps frames back, and their columns are gone then; "
+                    "use another strategy, or --teleop.record.columns=false"
+                )
+            self._last_state = state
+            frame = {**frame, **self._columns.build_row(state, tick, outcome)}
+        if not self._info.realtime:
+            self._video.wait()
+        self._video.wait_for_images()
+        tally.task = str(frame["task"])
+        try:
+            super().add_frame(frame)
+        except Exception as error:
+            self._explain(error)
+            raise
+        if state is not None:
+            tally.note_state(state)
+        if tick is not None:
+            tally.note_changes(tick)
+            tally.driven |= tick.engaged
+
+        tally.last = time.perf_counter()
+        if tally.frames == 0:
+            tally.first, tally.start_time = tally.last, time.time()
+        tally.frames += 1
+        tally.success = outcome is not None and outcome.success
+        if tally.marked is not None:
+            tally.success = tally.marked
+        tally.finished = tick is not None and tick.finished
+        is_over = tally.finished or tally.frames == self._tick_limit
+        if is_over or (self._stop_on_success and tally.success):
+            self._events["exit_early"] = True
+        length = tally.frames / self.fps
+        session.progress = Progress(self.num_episodes, tally.frames, length, tally.success)
+
+    def _current_tick(self) -> TickRecord | None:
+        """The teleoperator's record of this very tick, None if a policy drove the robot."""
+        session = self._session
+        tick, state = session.tick, session.state
+        if tick is None or state is None or tick.state.time != state.time:
+            return None
+        return tick
+
+    def save_episode(
+        self, episode_data: dict | None = None, parallel_encoding: bool = True
+    ) -> None:
+        """Save the episode so that it survives a crash, and ask the robot to start over.
+
+        One without a frame is none, and is not saved. If saving fails, the dataset is closed as
+        it was before.
+
+        Raises:
+            NotSaved: If the episode cannot be written; a full disk is the usual reason.
+            XopError: If frames of its videos were lost in lock-step.
+        """
+        if episode_data is None and not self.has_pending_frames():
+            if self._events:  # else none has begun: LeRobot's rollouts save once more at their end
+                logger.warning("Episode %d has no frame; it is not saved.", self.num_episodes)
+            return
+        facts, index = self._collect_facts(), self.num_episodes
+        if not self._info.realtime and facts.dropped_frames:
+            raise XopError(
+                f"episode {index} lost {facts.dropped_frames} video frames; it is not saved"
+            )
+        length = self._tally.frames
+        self._write_mark(episode_data)
+        with hold_signals(), skip_embedding(self), keep_schedule(), self._taken_back_on_failure():
+            check_pictures(self, index)
+            super().save_episode(episode_data, parallel_encoding)
+            self._secure()
+            keep_config(self.root, self._config)
+            append_facts(self.root, index, length, facts, self.more_facts)
+            self._own_root = False
+        if facts.dropped_frames or facts.late:
+            logger.warning(
+                "Episode %d dropped %d video frames and ran at %.1f Hz of %d; it is marked so.",
+                index,
+                facts.dropped_frames,
+                facts.real_fps,
+                self.fps,
+            )
+        self._begin_next(index + 1)
+
+    @contextmanager
+    def _taken_back_on_failure(self) -> Iterator[None]:
+        """Save in the block; if that fails, close the dataset as it was before.
+
+        Raises:
+            NotSaved: If the system did not write.
+        """
+        info = self.meta.info
+        counts = info.total_episodes, info.total_frames
+        checkpoint = Checkpoint(self.root)
+        try:
+            yield
+        except Exception as error:
+            abandon_writers(self)
+            whole = checkpoint.restore()
+            # `resume` may have made others meanwhile, in `_secure`.
+            self.meta.info.total_episodes, self.meta.info.total_frames = counts
+            self.finalize()
+            self._explain(error, whole=whole)
+            raise
+
+    def _explain(self, error: Exception, *, whole: bool = True) -> None:
+        """Say in one line that the system did not write, if that is what `error` comes from.
+
+        Raises:
+            NotSaved: If it is.
+        """
+        reason = find_reason(error)
+        if reason and not isinstance(error, NotSaved):
+            raise NotSaved(self.root, self.meta.total_episodes, reason, whole=whole) from error
+
+    def _write_mark(self, episode_data: dict | None) -> None:
+        """Bring `next.success` in line with the operator's mark, as `xop-curate label` does."""
+        marked = self._tally.marked
+        buffer = episode_data or (self.writer.episode_buffer if self.writer else {})
+        rows = buffer.get("next.success")
+        if marked is None or not rows:
+            return
+        rows[:] = [row if marked else np.zeros_like(row) for row in rows]
+        rows[-1] = np.full_like(rows[-1], marked)
+
+    def clear_episode_buffer(self, delete_images: bool = True) -> None:
+        """Discard the episode and ask the robot to start over."""
+        super().clear_episode_buffer(delete_images)
+        self._begin_next(self.num_episodes)
+
+    def finalize(self) -> None:
+        """Close all files; a dataset that never got an episode is removed again."""
+        if self._is_finalized:
+            return
+        super().finalize()
+        self._session.progress = None
+        if self._session.recorder is self:
+            self._session.recorder = None
+        durability.forget_rotation(self)
+        if self._own_root and self.num_episodes == 0:
+            shutil.rmtree(self.root, ignore_errors=True)
+
+    def _begin_next(self, index: int) -> None:
+        self._tally, self._events = Tally(), {}
+        self._session.progress = None
+        self._session.begin_episode(index)
+
+    def _secure(self) -> None:
+        if durability.can_rotate(self):
+            durability.rotate_writers(self)
+            return
+        kept = {name: value for name, value in vars(self).items() if name in _KEPT}
+        LeRobotDataset.finalize(self)
+        names = LeRobotDataset.resume.__func__.__code__.co_varnames  # type: ignore[attr-defined]
+        options = {key: value for key, value in self._create_options.items() if key in names}
+        fresh = super().resume(self.repo_id, root=self.root, **options)
+        self.__dict__.update(vars(fresh) | kept)
+        # `fresh` shares the writer now; it must not close it when it is collected.
+        fresh.writer = None
+        self._attach_writer()
+
+    def _collect_facts(self) -> EpisodeFacts:
+        tally, info = self._tally, self._info
+        return EpisodeFacts(
+            success=tally.success,
+            fallen=tally.fallen,
+            collision=tally.collision,
+            finished=tally.finished,
+            seed=info.seed,
+            task=tally.task,
+            robot=info.name,
+            scene=info.scene,
+            low_level=info.low_level,
+            clock="realtime" if info.realtime else "lockstep",
+            config_hash=self._config_hash,
+            versions=read_versions(),
+            start_time=tally.start_time,
+            real_fps=tally.fps,
+            dropped_frames=self._video.dropped,
+            settings=json.dumps(tally.settings),
+            changes=json.dumps(tally.changes),
+            late=info.realtime and tally.frames > 1 and tally.fps < _LATE * info.fps,
+        )
+
+
+def _check_encoding(options: Mapping[str, Any]) -> None:
+    """Refuse LeRobot's batches of videos, which are encoded after their episodes are saved.
+
+    Each episode has files of its own here, closed when it is saved; a batch would look for the
+    rows of all its episodes in one of them, and a killed process would lose its pictures.
+
+    Raises:
+        BatchedEncoding: If a batch is larger than one episode.
+    """
+    size = options.get("batch_encoding_size", 1)
+    if size > 1:
+        raise BatchedEncoding(size)
+
+
+_KEPT = (
+    "_session",
+    "_info",
+    "_columns",
+    "_create_options",
+    "_keep_facts",
+    "_own_root",
+    "_tally",
+    "_tick_limit",
+    "_stop_on_success",
+    "_paused",
+    "_events",
+    "_last_state",
+    "_config",
+    "_config_hash",
+    "more_facts",
+)
+"""Attributes that outlive a change of writer."""

@@ -1,0 +1,177 @@
+"""An episode that cannot be saved leaves the dataset as it was before.
+
+A save makes new files of rows, pictures and metadata, and rewrites a few small ones in place. If
+the disk fills up in the middle, LeRobot leaves files without their end and a cut `info.json`, and
+writes on while it is closed: nothing loads any more. Here the new files are removed, which makes
+room too, and the small ones are put back.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.wording import say_count
+from xop_lerobot.recording.facts import EPISODES_FILE
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
+
+_FOLDERS = ("data", "videos", "meta")
+_TEMPORARY = "tmp????????"
+"""LeRobot's directories for videos that are being encoded, in that of the dataset."""
+_LITTLE = 1 << 20
+"""Room under which a disk counts as full, where only that something is missing is known [byte]."""
+
+
+class NotSaved(XopError):
+    """An episode could not be written.
+
+    Args:
+        root: Directory of the dataset.
+        index: Index of the episode, which is also the number of those that are whole.
+        reason: Why, in the words of the system.
+        whole: Whether the dataset is as it was before.
+    """
+
+    def __init__(self, root: Path, index: int, reason: str, *, whole: bool = True) -> None:
+        self.index, self.reason = index, reason
+        text = f"episode {index} could not be saved to '{root}': {reason}. "
+        if not whole:
+            text += (
+                f"What it left there could not be removed. `xop-curate repair --root {root} --out "
+                "DIR` makes a whole dataset of the episodes before it"
+            )
+        elif index:
+            text += (
+                f"What was saved before it is whole: {say_count(index, 'episode')}. Once that is "
+                "mended, --resume=true goes on"
+            )
+        else:
+            text += "None was saved before it"
+        super().__init__(text)
+
+
+class Checkpoint:
+    """The files of a dataset at one moment, to which it can be put back.
+
+    Args:
+        root: Directory of the dataset.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._files = set(self._list())
+        self._rewritten = {
+            path: path.read_bytes() for path in (root / "meta").glob("*") if path.is_file()
+        }
+        facts = root / EPISODES_FILE
+        self._facts_size = facts.stat().st_size if facts.exists() else 0
+
+    def restore(self) -> bool:
+        """Put the files back; return whether all are as they were."""
+        try:
+            for path in set(self._list()) - self._files:
+                path.unlink()
+            for folder in self._root.glob(_TEMPORARY):
+                shutil.rmtree(folder, ignore_errors=True)
+            for path, content in self._rewritten.items():
+                if not path.exists() or path.read_bytes() != content:
+                    replace_file(path, content)
+            if self._facts_size:
+                os.truncate(self._root / EPISODES_FILE, self._facts_size)
+        except OSError:
+            return False
+        return True
+
+    def _list(self) -> Iterator[Path]:
+        for name in _FOLDERS:
+            for folder, _, files in os.walk(self._root / name):
+                yield from (Path(folder, file) for file in files)
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file anew, so that there is always the old one or the new one, and whole."""
+    fresh = path.with_name(f".{path.name}.new")
+    try:
+        fresh.write_bytes(content)
+        fresh.replace(path)
+    except OSError:
+        fresh.unlink(missing_ok=True)
+        raise
+
+
+def abandon_writers(dataset: LeRobotDataset) -> None:
+    """Let LeRobot close `dataset` without writing on what was begun.
+
+    This reaches into private attributes of LeRobot 0.6; where one is missing, nothing is done
+    about it.
+    """
+    writer, meta = dataset.writer, dataset.meta
+    if writer is not None:
+        with suppress(Exception):
+            writer.stop_image_writer()
+        with suppress(Exception):
+            writer.cancel_pending_videos()
+    for owner in (writer, meta):
+        if owner is not None:
+            _drop(getattr(owner, "_pq_writer", None))
+            owner._pq_writer, owner._finalized = None, True
+    getattr(meta, "_metadata_buffer", []).clear()
+
+
+def _drop(parquet: Any) -> None:
+    """Close a parquet writer whose file is not wanted any more."""
+    if parquet is None:
+        return
+    with suppress(Exception):
+        parquet.close()
+    parquet.is_open = False  # else it is closed, and fails, again when it is collected
+    with suppress(Exception):
+        parquet.file_handle.close()
+
+
+def check_pictures(dataset: LeRobotDataset, index: int) -> None:
+    """Check that the pictures of an episode are on the disk, where they go into files first.
+
+    LeRobot's image writer only logs what it could not write, and its encoder takes what it
+    finds: the video would be shorter than the episode, and show other moments.
+
+    Args:
+        dataset: The dataset, with an episode that is to be saved.
+        index: Index of the episode.
+
+    Raises:
+        NotSaved: If one is missing.
+    """
+    writer = dataset.writer
+    if writer is None:
+        return
+    if writer.image_writer is not None:
+        writer.image_writer.wait_until_done()
+    columns = [writer.episode_buffer.get(key, ()) for key in dataset.meta.camera_keys]
+    paths = [Path(name) for column in columns for name in column if isinstance(name, str)]
+    lost = [path for path in paths if not path.is_file() or path.stat().st_size == 0]
+    if lost:
+        reason = f"{len(lost)} of its {say_count(len(paths), 'picture')} could not be written"
+        if shutil.disk_usage(dataset.root).free < _LITTLE:
+            reason = f"{os.strerror(errno.ENOSPC)}; {reason}"
+        raise NotSaved(dataset.root, index, reason)
+
+
+def find_reason(error: BaseException | None) -> str:
+    """Say why the system did not write; empty where `error` is none of the system's."""
+    full = os.strerror(errno.ENOSPC)
+    while error is not None:
+        if isinstance(error, OSError):
+            return os.strerror(error.errno) if error.errno else str(error).splitlines()[0]
+        if full in str(error):  # of an encoder's thread
+            return full
+        error = error.__cause__ or error.__context__
+    return ""

@@ -1,0 +1,92 @@
+"""A trained policy gets pictures of the size that it was trained with.
+
+LeRobot's rollout compares names of cameras and not sizes: a policy that does not resize its
+pictures runs with others, and does badly without a word. While one of this project's robots is
+configured, `lerobot-rollout` therefore compares them before it loads or connects anything. Robots
+of others are passed through unchanged.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+from typing import TYPE_CHECKING, Any
+
+from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.mistakes import report_mistakes
+from xop_lerobot.recording.host import find
+
+if TYPE_CHECKING:
+    from lerobot_robot_xop.config_xop import XopRobotConfig
+
+logger = logging.getLogger(__name__)
+
+COMMAND_MODULE = "lerobot.scripts.lerobot_rollout"
+BUILD = "build_rollout_context"
+_RESIZING = (
+    "resize_shape", "image_resize_shape", "resize_imgs_with_padding", "resize_images_to",
+    "image_resolution", "image_size",
+)  # fmt: skip
+"""Settings of LeRobot's policies that bring pictures of any size to one."""
+
+
+def watch_rollouts(ours: type[XopRobotConfig]) -> None:
+    """Let `lerobot-rollout`, if that is what runs, check the sizes of pictures first.
+
+    Args:
+        ours: Configuration of the robots whose pictures are compared.
+    """
+    module = find(COMMAND_MODULE)
+    if module is None:
+        return
+    stock = getattr(module, BUILD, None)
+    if stock is None:
+        logger.warning(
+            "LeRobot has changed (%s has no %s), so nobody compares a policy's pictures with the "
+            "robot's.",
+            COMMAND_MODULE,
+            BUILD,
+        )
+        return
+    if hasattr(stock, "xop_stock"):
+        return
+    report_mistakes()
+
+    @functools.wraps(stock)
+    def build(cfg: Any, *args: Any, **kwargs: Any) -> Any:
+        """Check the pictures of an xop robot, then do what LeRobot does."""
+        if isinstance(cfg.robot, ours):
+            check_pictures(cfg.robot, cfg.policy, getattr(cfg, "rename_map", None) or {})
+        return stock(cfg, *args, **kwargs)
+
+    build.xop_stock = stock  # pyright: ignore[reportAttributeAccessIssue]
+    setattr(module, BUILD, build)
+
+
+def check_pictures(robot: XopRobotConfig, policy: Any, names: dict[str, str]) -> None:
+    """Check that a policy was trained with pictures of the robot's size.
+
+    Args:
+        robot: The robot.
+        policy: LeRobot's configuration of the policy.
+        names: What the policy calls a camera, by the robot's name of its column.
+
+    Raises:
+        BadValue: If it was trained with others, and does not resize them itself.
+    """
+    inputs = getattr(policy, "input_features", None) or {}
+    for camera in robot.cameras:
+        key = f"observation.images.{camera}"
+        feature = inputs.get(names.get(key, key))
+        if feature is None or len(feature.shape) != 3:
+            continue
+        _, height, width = feature.shape
+        if (height, width) == (robot.height, robot.width):
+            continue
+        fault = (
+            f"the policy was trained with pictures of {width} x {height} of camera '{camera}', "
+            f"and the robot's are {robot.width} x {robot.height}"
+        )
+        if not any(getattr(policy, name, None) for name in _RESIZING):
+            raise BadValue(f"{fault}. Use --robot.width={width} --robot.height={height}")
+        logger.warning("%s%s; it resizes them itself.", fault[0].upper(), fault[1:])
