@@ -22,7 +22,6 @@ from lerobot.datasets.utils import DEFAULT_DATA_PATH
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import make_pose, quat_from_yaw
 from xop_lerobot.core.versions import read_versions
-from xop_lerobot.link import RobotInfo
 from xop_lerobot.morphology.body import Body
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.recording.columns import HEALTH_NAMES, Columns
@@ -32,6 +31,7 @@ from xop_lerobot.recording.facts import (
     compute_config_hash,
     write_config,
 )
+from xop_lerobot.session import RobotInfo
 
 TASK = "walk to and fro and wave"
 _SUCCEEDS, _FALLS, _LOSES = 0.7, 0.05, 0.1

@@ -11,9 +11,9 @@ import numpy as np
 from xop_lerobot.core.transforms import quat_conjugate, quat_log, quat_multiply
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.recording import load_recording
-from xop_lerobot.operator.simulated.body import SIDES, Body
-from xop_lerobot.operator.simulated.hands import compute_reach_time
-from xop_lerobot.operator.simulated.mind import Mind
+from xop_lerobot.tasks.person.body import SIDES, Body
+from xop_lerobot.tasks.person.hands import compute_reach_time
+from xop_lerobot.tasks.person.mind import Mind
 
 RATE = 60.0
 """Rate at which motions are compared [Hz]."""

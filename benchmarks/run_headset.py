@@ -176,7 +176,6 @@ def add_device(delays: Delays, origin: Any) -> None:
 
 def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
     """Let the sender drive the robot in real time until it is gone."""
-    from xop_lerobot.link import RobotInfo
     from xop_lerobot.low_level.factory import make_policy
     from xop_lerobot.morphology.morphology import make_morphology
     from xop_lerobot.operator.devices import DeviceConfig
@@ -184,6 +183,7 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
     from xop_lerobot.plant.policy_loop import PolicyLoop
     from xop_lerobot.plant.simulation import Simulation
     from xop_lerobot.retarget.config import RetargeterConfig
+    from xop_lerobot.session import RobotInfo
     from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
     robot, low_level, fps = settings.robot, POLICIES[settings.robot], settings.fps

@@ -196,9 +196,9 @@ class Recorder:
 
         from lerobot_robot_xop.config_xop import XopG1Config
         from lerobot_robot_xop.xop_robot import XopG1
-        from xop_lerobot.link import get_session
         from xop_lerobot.recording.dataset import XopDataset
         from xop_lerobot.recording.record import build_features
+        from xop_lerobot.session import get_session
 
         self._seed, self._session = seed, get_session(SESSION)
         self.robot: XopRobot = XopG1(

@@ -27,7 +27,6 @@ from xop_lerobot.core.transforms import (
     quat_from_yaw,
     rotation_error,
 )
-from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.device import Device
@@ -36,9 +35,10 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.retarget.model.posture import Repertoire
 from xop_lerobot.retarget.mpc import MpcRetargeter
-from xop_lerobot.retarget.posture import Repertoire
 from xop_lerobot.retarget.posture_guide import make_static_load
+from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 NEAR_M, NEAR_DEG = 0.05, 5.0

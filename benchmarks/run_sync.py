@@ -28,8 +28,8 @@ from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation, SimulationConfig
 from xop_lerobot.retarget.rollout import PolicyRollout
-from xop_lerobot.retarget.state_sync import StateSync
-from xop_lerobot.retarget.sync_config import SyncConfig
+from xop_lerobot.retarget.sync.config import SyncConfig
+from xop_lerobot.retarget.sync.state_sync import StateSync
 
 TICK = 0.04  # of the teleoperator [s]
 HORIZONS = (3, 10)  # 60 and 200 ms [control steps]

@@ -38,7 +38,6 @@ from xop_lerobot.core.transforms import (
     pose_multiply,
     quat_from_yaw,
 )
-from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.scene import build_model
@@ -49,8 +48,9 @@ from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Status
+from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 TRACE_DT = 0.2

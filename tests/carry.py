@@ -18,7 +18,7 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
-from xop_lerobot.retarget.arm_driver import ArmDriver
+from xop_lerobot.retarget.arms.driver import ArmDriver
 from xop_lerobot.tasks.non_prehensile_transport import NonPrehensileTransport
 from xop_lerobot.tasks.palm import PALM_UP
 from xop_lerobot.tasks.stage import Stage

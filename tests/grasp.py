@@ -12,7 +12,7 @@ from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_rotate
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
-from xop_lerobot.retarget.arm_driver import ArmDriver
+from xop_lerobot.retarget.arms.driver import ArmDriver
 from xop_lerobot.tasks import furniture
 from xop_lerobot.tasks.box_pick_and_place import BOX, SPOT, SUPPORT, BoxPickAndPlace
 from xop_lerobot.tasks.stage import Stage

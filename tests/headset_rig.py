@@ -16,7 +16,6 @@ from avp_server import wait_for
 from xop_lerobot.core.command import RobotAction
 from xop_lerobot.core.state import Goal
 from xop_lerobot.core.transforms import make_pose, quat_exp, quat_multiply
-from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.devices import DeviceConfig
@@ -26,6 +25,7 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.session import RobotInfo, TickRecord
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}

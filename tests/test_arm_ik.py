@@ -15,8 +15,8 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.arm_ik import ArmIk, _find_pairs
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.arms.ik import ArmIk, _find_pairs
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 
 DT = 0.04
 MAX_SPEED = 3.0

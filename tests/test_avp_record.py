@@ -23,10 +23,10 @@ from lerobot.datasets import LeRobotDataset
 from test_lerobot_cli import record_flags, run
 
 from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_rpy
-from xop_lerobot.link import get_session
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.recording import Recording, load_recording
 from xop_lerobot.recording.facts import read_facts
+from xop_lerobot.session import get_session
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[2] / "shared"))
 RATE = 60

@@ -15,7 +15,6 @@ from toy_robot import make_toy
 from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.errors import BadValue, NotConnected, XopError
 from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_rotate
-from xop_lerobot.link import get_session
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.reach import compute_forward_reach
 from xop_lerobot.morphology.scene import build_model
@@ -34,6 +33,7 @@ from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.operator.display import Display
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.session import get_session
 
 RATE = 50
 EYES, REACH = 1.63, 0.58

@@ -17,10 +17,10 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.direct import DirectRetargeter
+from xop_lerobot.retarget.model.proposal import pace
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.optimizer import Samples
 from xop_lerobot.retarget.plan import Plan
-from xop_lerobot.retarget.proposal import pace
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
 robots = pytest.mark.parametrize("name", list(POLICIES))

@@ -30,7 +30,6 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue, LinkError, XopError
 from xop_lerobot.core.shutdown import hold_signals
 from xop_lerobot.core.state import FRAMES, Goal
-from xop_lerobot.link import Executed, Outcome, TickRecord, get_session
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.recording import durability, embedding
 from xop_lerobot.recording.columns import COST_NAMES, HEALTH_NAMES, Columns
@@ -44,6 +43,7 @@ from xop_lerobot.recording.executed import put_executed
 from xop_lerobot.recording.facts import compute_config_hash, read_facts
 from xop_lerobot.recording.record import build_features
 from xop_lerobot.recording.video_queue import MAX_IMAGES, VideoQueue
+from xop_lerobot.session import Executed, Outcome, TickRecord, get_session
 
 REPO = Path(__file__).parents[1]
 POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]

@@ -9,7 +9,7 @@ from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.arm_ik import ARM_MAX_RATE
+from xop_lerobot.retarget.arms.ik import ARM_MAX_RATE
 from xop_lerobot.retarget.decision import ARM_LAG_S, DecisionSpace
 
 ROBOTS = {"g1": 7 + 14, "rby1": 8 + 14}

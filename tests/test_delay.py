@@ -12,7 +12,6 @@ from test_teleoperation import POLICIES, SMALL, Person, make_frame
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.state import Goal
 from xop_lerobot.core.transforms import make_pose, quat_from_yaw, rotation_error
-from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
@@ -26,6 +25,7 @@ from xop_lerobot.retarget.delay import LatencyMeter, StatePredictor, predict_goa
 from xop_lerobot.retarget.plan import Plan
 from xop_lerobot.retarget.plan_track import GRACE_S, PlanTrack, StampedPlan
 from xop_lerobot.retarget.rollout import PolicyRollout
+from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 SPACE = make_morphology("rby1").command_space

@@ -10,7 +10,7 @@ from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import make_pose, quat_exp
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 
 MIXED = """
 <mujoco>

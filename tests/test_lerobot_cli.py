@@ -25,10 +25,10 @@ from lerobot_rows import get_episodes, get_row
 from xop_lerobot.control.client import ControlClient
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue, XopError
-from xop_lerobot.link import get_session
 from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.recording.record import XopRecordConfig
+from xop_lerobot.session import get_session
 
 REPO = Path(__file__).parents[1]
 ROBOT = ("--robot.type=xop_toy", "--robot.width=64", "--robot.height=48")

@@ -10,8 +10,8 @@ from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.core.transforms import quat_exp, rotation_error
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.retarget.linearisation import Linearisation, Placement, find_site
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
+from xop_lerobot.retarget.model.linearisation import Linearisation, Placement, find_site
 
 ROBOTS = ("g1", "rby1")
 robots = pytest.mark.parametrize("name", ROBOTS)

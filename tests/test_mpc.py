@@ -27,7 +27,7 @@ from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.horizon_goals import preview
 from xop_lerobot.retarget.intervention import Intervention
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan, Status
 

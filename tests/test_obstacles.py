@@ -12,7 +12,6 @@ from lerobot_robot_xop import XopG1, XopG1Config
 from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import quat_exp, quat_from_rpy, quat_rotate
-from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -23,6 +22,7 @@ from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacle_file import BadObstacles, load_obstacles
 from xop_lerobot.retarget.obstacles import SHAPES, Obstacle, ObstacleSet, make_obstacles
+from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 BOX = Obstacle(

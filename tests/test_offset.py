@@ -15,10 +15,10 @@ from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.offset import OffsetObserver
 from xop_lerobot.retarget.mpc import MpcRetargeter
-from xop_lerobot.retarget.offset import OffsetObserver
 
 DT = 0.04
 

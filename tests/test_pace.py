@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.retarget.proposal import pace
+from xop_lerobot.retarget.model.proposal import pace
 
 REACH = np.array([0.1, 0.02, 1.0])
 

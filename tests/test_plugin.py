@@ -29,7 +29,7 @@ from lerobot_robot_xop import (
 )
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadRecording, BadValue, LinkError, NotConnected, UnknownName
-from xop_lerobot.link import get_session
+from xop_lerobot.session import get_session
 
 REPO = Path(__file__).parents[1]
 HEAVY = ("mujoco", "lerobot.datasets", "lerobot.policies", "mink", "onnxruntime", "viser", "scipy")

@@ -16,9 +16,9 @@ from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.retarget.linearisation import Placement
+from xop_lerobot.retarget.model.linearisation import Placement
+from xop_lerobot.retarget.model.posture import AT_REST_S
 from xop_lerobot.retarget.mpc import MpcRetargeter
-from xop_lerobot.retarget.posture import AT_REST_S
 from xop_lerobot.retarget.static_load import StaticLoad
 
 ROBOTS = ("g1", "rby1")

@@ -25,14 +25,14 @@ from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.costs import SupportArea
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
-from xop_lerobot.retarget.heading import linearise_heading
-from xop_lerobot.retarget.kinematics import SiteKinematics
-from xop_lerobot.retarget.linearisation import Placement
-from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
+from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.heading import linearise_heading
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
+from xop_lerobot.retarget.model.linearisation import Placement
+from xop_lerobot.retarget.model.proposal import KinematicProposal, ProposalWeights
 
 ROBOTS = ("g1", "rby1")
 DT = 0.6

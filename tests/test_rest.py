@@ -15,7 +15,7 @@ from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.low_level.rest import RestMap
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel
 
 HEIGHTS, PITCHES = [0.4, 0.5, 0.6, 0.8], [-0.5, 0.0, 0.4]
 HEIGHT, PITCH = 0, 3

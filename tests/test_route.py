@@ -18,12 +18,12 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.footprint import Footprint
-from xop_lerobot.retarget.guidance import Guidance, compute_times
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.guidance.footprint import Footprint
+from xop_lerobot.retarget.guidance.guidance import Guidance, compute_times
+from xop_lerobot.retarget.guidance.route import RoutePlanner
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
-from xop_lerobot.retarget.route import RoutePlanner
 
 RESTING = 0.03  # how far the head is ahead of the base [m]
 LEAN = 0.1  # what is left to the torso [m]
@@ -98,7 +98,7 @@ def test_a_way_computed_anew_goes_on_as_before(planner, rby1):
     whole = go(planner, rby1, goal, duration=4.0)
     # Drive the law by hand for half a second, with the planner's own step.
     x, y, yaw, v, w = rby1.pivot, 0.0, 0.0, 0.0, 0.0
-    from xop_lerobot.retarget.route import _Aim, _clamp, _steer
+    from xop_lerobot.retarget.guidance.route import _Aim, _clamp, _steer
 
     aim = _Aim(goal[0], goal[1], 0.3, 1.9, (RESTING - rby1.pivot, 0.0))
     for _ in range(12):

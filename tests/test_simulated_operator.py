@@ -11,15 +11,15 @@ from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import make_pose, quat_log, quat_multiply, quat_yaw
 from xop_lerobot.core.transforms import quat_conjugate as conjugate
 from xop_lerobot.operator.devices import DeviceConfig, make_device
-from xop_lerobot.operator.devices.simulated import SimulatedDevice
 from xop_lerobot.operator.noise import HumanNoise
-from xop_lerobot.operator.simulated.body import Body, relaxed_hands
-from xop_lerobot.operator.simulated.box_pick_and_place import bring_up
-from xop_lerobot.operator.simulated.hands import LARGEST_BEND
-from xop_lerobot.operator.simulated.intentions import INTENTIONS
-from xop_lerobot.operator.simulated.perception import Perception
-from xop_lerobot.operator.simulated.person import Person, draw_person
 from xop_lerobot.operator.view import SeenObject, View
+from xop_lerobot.tasks.person.body import Body, relaxed_hands
+from xop_lerobot.tasks.person.box_pick_and_place import bring_up
+from xop_lerobot.tasks.person.device import SimulatedDevice
+from xop_lerobot.tasks.person.hands import LARGEST_BEND
+from xop_lerobot.tasks.person.intentions import INTENTIONS
+from xop_lerobot.tasks.person.perception import Perception
+from xop_lerobot.tasks.person.person import Person, draw_person
 
 UNIT = np.array([1.0, 0, 0, 0])
 

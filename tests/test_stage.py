@@ -13,7 +13,6 @@ from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.core.state import Goal
-from xop_lerobot.link import Session, get_session
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -25,6 +24,7 @@ from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Retargeter
+from xop_lerobot.session import Session, get_session
 from xop_lerobot.tasks.dual_point_touch import TOLERANCE
 from xop_lerobot.tasks.furniture import place
 from xop_lerobot.tasks.stage import Stage

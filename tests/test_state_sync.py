@@ -18,8 +18,8 @@ from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation, SimulationConfig
-from xop_lerobot.retarget.state_sync import StateSync
-from xop_lerobot.retarget.sync_config import SyncConfig, SyncStatus
+from xop_lerobot.retarget.sync.config import SyncConfig, SyncStatus
+from xop_lerobot.retarget.sync.state_sync import StateSync
 
 ROBOTS = ("g1", "rby1", "toy")
 DT = 0.04

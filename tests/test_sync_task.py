@@ -11,10 +11,10 @@ import toy_robot
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.sync_config import SyncConfig
-from xop_lerobot.retarget.sync_contacts import compute_equilibrium, make_contacts
-from xop_lerobot.retarget.sync_task import SyncTask
-from xop_lerobot.retarget.velocity_projection import (
+from xop_lerobot.retarget.sync.config import SyncConfig
+from xop_lerobot.retarget.sync.contacts import compute_equilibrium, make_contacts
+from xop_lerobot.retarget.sync.task import SyncTask
+from xop_lerobot.retarget.sync.velocity_projection import (
     ContactVelocity,
     compute_disagreement,
     project_velocity,

@@ -15,7 +15,6 @@ import pytest
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.state import FRAMES, Goal, RobotState
 from xop_lerobot.core.transforms import make_pose, quat_from_rpy, quat_from_yaw, quat_rotate
-from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.alignment import EngageRefused
@@ -27,9 +26,10 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Plan, Retargeter
 from xop_lerobot.retarget.plan_track import StampedPlan
+from xop_lerobot.session import RobotInfo, TickRecord
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}

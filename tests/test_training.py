@@ -29,10 +29,10 @@ from reached import collect_reach
 
 from lerobot_robot_xop import XopG1Config, XopRby1Config
 from lerobot_robot_xop.xop_robot import XopG1, XopRby1
-from xop_lerobot.link import get_session
 from xop_lerobot.recording.columns import OWN_PREFIXES, Columns
 from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.recording.record import build_features
+from xop_lerobot.session import get_session
 
 REPO = Path(__file__).parents[1]
 CONFIG = REPO / "configs" / "train_act_rby1_reach.yaml"

@@ -23,7 +23,6 @@ from lerobot_robot_xop.xop_robot import XopRobot
 from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.core.state import RobotState
-from xop_lerobot.link import get_session
 from xop_lerobot.low_level.factory import POLICIES
 from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
 from xop_lerobot.morphology.effect import Acts, Effect
@@ -31,6 +30,7 @@ from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind,
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.session import get_session
 
 MJCF = """
 <mujoco>

@@ -13,7 +13,6 @@ import numpy as np
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.errors import XopError
 from xop_lerobot.core.state import FRAMES, Goal, RobotState
-from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.reach import compute_forward_reach
 from xop_lerobot.morphology.scene import build_model
@@ -33,18 +32,19 @@ from xop_lerobot.operator.telling import list_warnings, tell_changes
 from xop_lerobot.operator.view import View
 from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.plant.watch import MOVES
-from xop_lerobot.retarget.arm_driver import ArmDriver
+from xop_lerobot.retarget.arms.driver import ArmDriver
 from xop_lerobot.retarget.changes import Change, Settings, make_toggle, parse_change
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
 from xop_lerobot.retarget.factory import make_retargeter, warn_of_obstacles, warn_of_scene
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.obstacle_file import load_obstacles
 from xop_lerobot.retarget.online import AppliedChange, OnlineSettings
 from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.retarget.smoothing import CommandSmoother
-from xop_lerobot.retarget.state_sync import StateSync, Synced
+from xop_lerobot.retarget.sync.state_sync import StateSync, Synced
+from xop_lerobot.session import RobotInfo, TickRecord
 
 RETREAT_RATE = 1.0
 """Speed at which arms in trouble go back to rest [rad/s]."""

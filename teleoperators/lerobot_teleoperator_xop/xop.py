@@ -16,7 +16,6 @@ from lerobot_teleoperator_xop.config_xop import XopConfig
 from xop_lerobot.control.protocol import find_socket
 from xop_lerobot.core.errors import LinkError, NotConnected, XopError
 from xop_lerobot.core.mistakes import report_mistakes
-from xop_lerobot.link import RobotInfo, get_session
 from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.calibration import (
     Calibration,
@@ -26,6 +25,7 @@ from xop_lerobot.operator.calibration import (
 )
 from xop_lerobot.operator.devices import make_device
 from xop_lerobot.recording.host import Host
+from xop_lerobot.session import RobotInfo, get_session
 
 if TYPE_CHECKING:
     from lerobot.utils.keyboard_input import TerminalKeyListener

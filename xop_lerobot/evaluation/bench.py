@@ -39,7 +39,6 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
 )
 from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
-from xop_lerobot.link import RobotInfo
 from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
@@ -49,10 +48,11 @@ from xop_lerobot.plant.config import NOISE_PRESETS, SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import PRESETS, RetargeterConfig
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.rollout import PolicyRollout
-from xop_lerobot.retarget.state_sync import StateSync
+from xop_lerobot.retarget.sync.state_sync import StateSync
+from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 LEAD_IN_S = 1.0

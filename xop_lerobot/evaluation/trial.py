@@ -16,13 +16,13 @@ import numpy as np
 
 from xop_lerobot.core.state import FRAMES, RobotState
 from xop_lerobot.evaluation.methods import make_retargeter_config, resolve_low_level
-from xop_lerobot.link import RobotInfo, TickRecord
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.view import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.session import RobotInfo, TickRecord
 from xop_lerobot.tasks.task import TASKS, TaskStatus, make_task
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 

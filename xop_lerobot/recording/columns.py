@@ -14,8 +14,8 @@ import numpy as np
 
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.state import FRAMES, RobotState
-from xop_lerobot.link import Outcome, RobotInfo, TickRecord
 from xop_lerobot.morphology.body import Body
+from xop_lerobot.session import Outcome, RobotInfo, TickRecord
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 COST_NAMES = (

@@ -2,7 +2,7 @@
 
 `XopDataset` is `LeRobotDataset` in every respect that LeRobot's loops see: while it records,
 `features` shows LeRobot's own columns alone. What it adds comes from the session in which robot
-and teleoperator meet (`xop_lerobot.link`), so the loops need not know of it.
+and teleoperator meet (`xop_lerobot.session`), so the loops need not know of it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from xop_lerobot.core.errors import BadDataset, BadValue, XopError
 from xop_lerobot.core.shutdown import hold_signals
 from xop_lerobot.core.state import RobotState
 from xop_lerobot.core.versions import read_versions
-from xop_lerobot.link import RobotInfo, Session, TickRecord, get_session
 from xop_lerobot.operator.display import Cue, Progress, Wish
 from xop_lerobot.recording import durability
 from xop_lerobot.recording.columns import Columns, has_all_columns, is_own_column
@@ -53,6 +52,7 @@ from xop_lerobot.recording.rollback import (
 from xop_lerobot.recording.schedule import keep_schedule
 from xop_lerobot.recording.tally import Tally
 from xop_lerobot.recording.video_queue import VideoQueue
+from xop_lerobot.session import RobotInfo, Session, TickRecord, get_session
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ import numpy as np
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 if TYPE_CHECKING:
-    from xop_lerobot.link import Executed
+    from xop_lerobot.session import Executed
 
 
 def put_executed(

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 from xop_lerobot.core.errors import LinkError
 from xop_lerobot.core.shutdown import TermAsInterrupt
-from xop_lerobot.link import get_session
 from xop_lerobot.recording.lockstep import count_ticks, without_slowness
+from xop_lerobot.session import get_session
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset

@@ -13,7 +13,7 @@ from xop_lerobot.morphology.body import Body
 from xop_lerobot.recording.columns import is_own_column
 
 if TYPE_CHECKING:
-    from xop_lerobot.link import RobotInfo
+    from xop_lerobot.session import RobotInfo
 
 PICTURES = f"{OBS_IMAGES}."
 _OTHERS = ("intervention",)

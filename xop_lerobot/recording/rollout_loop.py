@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.link import get_session
 from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.lockstep import count_ticks, without_slowness
+from xop_lerobot.session import get_session
 
 STRATEGY_MODULE = "lerobot.rollout.strategies.episodic"
 STRATEGY = "EpisodicStrategy"

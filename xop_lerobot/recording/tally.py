@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from xop_lerobot.core.state import RobotState
-from xop_lerobot.link import TickRecord
+from xop_lerobot.session import TickRecord
 
 
 class Tally:

@@ -11,13 +11,13 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.costs.support import SupportArea
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
-from xop_lerobot.retarget.offset import OffsetObserver
+from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.offset import OffsetObserver
+from xop_lerobot.retarget.model.proposal import KinematicProposal, make_proposal_weights, pace
 from xop_lerobot.retarget.posture_guide import Served
-from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights, pace
 from xop_lerobot.retarget.static_load import StaticLoad
 
 

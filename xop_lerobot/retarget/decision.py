@@ -8,7 +8,7 @@ import numpy as np
 from xop_lerobot.core.command import CommandDim
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.arm_ik import ARM_MAX_RATE
+from xop_lerobot.retarget.arms.ik import ARM_MAX_RATE
 
 ARM_LAG_S = 0.1
 """Time constant with which arm joints follow their targets, to first order [s]."""

@@ -19,9 +19,9 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
+from xop_lerobot.retarget.model.command_model import CommandModel, find_joints_along
+from xop_lerobot.retarget.model.proposal import KinematicProposal, ProposalWeights
 from xop_lerobot.retarget.plan import Plan, Retargeter
-from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights
 
 
 class DirectRetargeter(Retargeter):

@@ -25,11 +25,11 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.command_model import CommandModel, find_joints_along
 from xop_lerobot.retarget.costs.support import SupportArea
-from xop_lerobot.retarget.linearisation import Placement
-from xop_lerobot.retarget.posture import AT_REST_S, MISSED, Found, PostureSearch, Repertoire
-from xop_lerobot.retarget.proposal import KinematicProposal, make_proposal_weights
+from xop_lerobot.retarget.model.command_model import CommandModel, find_joints_along
+from xop_lerobot.retarget.model.linearisation import Placement
+from xop_lerobot.retarget.model.posture import AT_REST_S, MISSED, Found, PostureSearch, Repertoire
+from xop_lerobot.retarget.model.proposal import KinematicProposal, make_proposal_weights
 from xop_lerobot.retarget.static_load import StaticLoad
 
 HEAD = "head"

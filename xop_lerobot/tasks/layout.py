@@ -10,8 +10,8 @@ import numpy as np
 
 from xop_lerobot.core.transforms import make_pose, pose_multiply
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.arm_ik import ArmIk
-from xop_lerobot.retarget.kinematics import SiteKinematics
+from xop_lerobot.retarget.arms.ik import ArmIk
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 
 DRAW_IN = 0.12
 """Farther than this nobody draws in hands [m]."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from xop_lerobot.core.transforms import make_pose, pose_inverse, pose_multiply, quat_from_rpy
 from xop_lerobot.morphology.links import FLOOR_BIT, OBJECT_BIT
-from xop_lerobot.retarget.arm_ik import ArmIk
+from xop_lerobot.retarget.arms.ik import ArmIk
 from xop_lerobot.tasks.layout import Pad, Reach
 
 if TYPE_CHECKING:

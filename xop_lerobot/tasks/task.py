@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from xop_lerobot.core.registry import Registry
-from xop_lerobot.link import Outcome
 from xop_lerobot.operator.view import SeenObject
+from xop_lerobot.session import Outcome
 from xop_lerobot.tasks.heights import HeightRange, check_heights, parse_heights
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ DEVICES: Registry[Callable[[DeviceConfig], Device]] = Registry(
         "avp": "xop_lerobot.operator.devices.avp:AvpDevice",
         "replay": "xop_lerobot.operator.devices.replay:ReplayDevice",
         "scripted": "xop_lerobot.operator.devices.scripted:ScriptedDevice",
-        "simulated": "xop_lerobot.operator.devices.simulated:SimulatedDevice",
+        "simulated": "xop_lerobot.tasks.person.device:SimulatedDevice",
         "webxr": "xop_lerobot.operator.devices.webxr:WebXrDevice",
     },
 )

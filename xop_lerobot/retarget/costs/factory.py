@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.costs.change import ChangeCost
 from xop_lerobot.retarget.costs.collision import CollisionCost
 from xop_lerobot.retarget.costs.control import ControlCost
@@ -16,6 +17,9 @@ from xop_lerobot.retarget.costs.terminal import TerminalCost
 from xop_lerobot.retarget.costs.tracking import TrackingCost
 from xop_lerobot.retarget.costs.upright import UprightCost
 from xop_lerobot.retarget.static_load import StaticLoad
+
+if TYPE_CHECKING:
+    from xop_lerobot.retarget.model.command_model import CommandModel
 
 
 def make_costs(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel
 
 _QUIET = 0.03  # distance of the lagged command from the command at which a robot rests, of scale
 

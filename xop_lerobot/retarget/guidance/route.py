@@ -11,7 +11,7 @@ import numpy as np
 
 from xop_lerobot.core.transforms import compute_heading, quat_yaw
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.footprint import Footprint
+from xop_lerobot.retarget.guidance.footprint import Footprint
 
 _DT = 0.04  # step of the simulated way [s]
 _MAX_SPEED, _ACCELERATION, _BRAKING = 1.2, 1.5, 1.0  # [m/s], [m/s²], [m/s²]

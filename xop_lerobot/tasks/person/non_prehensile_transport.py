@@ -17,10 +17,10 @@ from xop_lerobot.core.transforms import (
     wrap_angle,
 )
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import SIDES
-from xop_lerobot.operator.simulated.hands import take_posture
-from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.operator.simulated.walking import compute_miss, go_to, set_mode
+from xop_lerobot.tasks.person.body import SIDES
+from xop_lerobot.tasks.person.hands import take_posture
+from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
+from xop_lerobot.tasks.person.walking import compute_miss, go_to, set_mode
 
 NOD = 0.25
 """How far the person nods to see the own palm [rad]."""

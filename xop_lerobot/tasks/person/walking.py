@@ -9,8 +9,8 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import quat_from_yaw, quat_rotate, quat_to_rpy, wrap_angle
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import Posture, relaxed_hands, stand_upright
-from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
+from xop_lerobot.tasks.person.body import Posture, relaxed_hands, stand_upright
+from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 
 LAG = 0.4
 """How long a person still looks when the own turn is over: the robot may be behind [s]."""

@@ -11,11 +11,11 @@ from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_yaw,
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.noise import HumanNoise
-from xop_lerobot.operator.simulated.belief import Belief
-from xop_lerobot.operator.simulated.body import SIDES, Body
-from xop_lerobot.operator.simulated.perception import Perception
-from xop_lerobot.operator.simulated.person import Person, draw_person
 from xop_lerobot.operator.view import View
+from xop_lerobot.tasks.person.belief import Belief
+from xop_lerobot.tasks.person.body import SIDES, Body
+from xop_lerobot.tasks.person.perception import Perception
+from xop_lerobot.tasks.person.person import Person, draw_person
 
 PALM = 0.1
 """From a person's wrist to the middle of the palm [m]."""

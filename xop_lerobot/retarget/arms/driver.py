@@ -12,13 +12,13 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.core.state import FRAMES, Goal, RobotState
 from xop_lerobot.core.transforms import make_pose, quat_from_matrix
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.arm_bias import ArmBias
-from xop_lerobot.retarget.arm_hold import ArmHold
-from xop_lerobot.retarget.arm_ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
-from xop_lerobot.retarget.arm_load import ArmLoad
-from xop_lerobot.retarget.arm_yield import ArmYield
-from xop_lerobot.retarget.servo_filter import SteadyBody
-from xop_lerobot.retarget.wrist_goals import compute_wrist_goals
+from xop_lerobot.retarget.arms.bias import ArmBias
+from xop_lerobot.retarget.arms.hold import ArmHold
+from xop_lerobot.retarget.arms.ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
+from xop_lerobot.retarget.arms.load import ArmLoad
+from xop_lerobot.retarget.arms.servo_filter import SteadyBody
+from xop_lerobot.retarget.arms.wrist_goals import compute_wrist_goals
+from xop_lerobot.retarget.arms.yielding import ArmYield
 
 BIAS_TIME = 1.5
 """Time in which offsets of the arms are learned [s]. With 0.5 s the arms of G1, which are soft,

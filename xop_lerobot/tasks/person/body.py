@@ -20,7 +20,7 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
 from xop_lerobot.operator.noise import HumanNoise
-from xop_lerobot.operator.simulated.person import Person
+from xop_lerobot.tasks.person.person import Person
 
 SIDES: tuple[str, str] = ("left", "right")
 OPEN, SHUT = 0.08, 0.008

@@ -18,7 +18,7 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
     quat_to_rpy,
 )
-from xop_lerobot.operator.simulated.body import (
+from xop_lerobot.tasks.person.body import (
     HIPS_BACK,
     NECK,
     SIDES,
@@ -26,7 +26,7 @@ from xop_lerobot.operator.simulated.body import (
     Posture,
     compute_sinking,
 )
-from xop_lerobot.operator.simulated.mind import Doing, Mind
+from xop_lerobot.tasks.person.mind import Doing, Mind
 
 MARGIN = 0.08
 """How far within the field of view a person wants to have what the hands work on [rad]."""

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.retarget.sync_config import SyncConfig
-from xop_lerobot.retarget.sync_contacts import Contact, compute_height
+from xop_lerobot.retarget.sync.config import SyncConfig
+from xop_lerobot.retarget.sync.contacts import Contact, compute_height
 
 _RECENT = 0.2  # share of the newest tick in the recent mean of where a foot is seen
 

@@ -19,10 +19,10 @@ from xop_lerobot.core.transforms import (
     rotation_error,
     sum_squares,
 )
-from xop_lerobot.retarget.command_model import CommandModel
 from xop_lerobot.retarget.costs.support import SupportArea
-from xop_lerobot.retarget.linearisation import Placement
-from xop_lerobot.retarget.proposal import KinematicProposal, ProposalWeights, Solution
+from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.linearisation import Placement
+from xop_lerobot.retarget.model.proposal import KinematicProposal, ProposalWeights, Solution
 from xop_lerobot.retarget.static_load import StaticLoad
 
 AT_REST_S = 20.0

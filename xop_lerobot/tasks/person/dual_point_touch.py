@@ -6,8 +6,8 @@ import numpy as np
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import SIDES
-from xop_lerobot.operator.simulated.hands import (
+from xop_lerobot.tasks.person.body import SIDES
+from xop_lerobot.tasks.person.hands import (
     compute_bend,
     compute_distance,
     compute_errors,
@@ -21,8 +21,8 @@ from xop_lerobot.operator.simulated.hands import (
     reach,
     take_posture,
 )
-from xop_lerobot.operator.simulated.mind import Doing, Mind
-from xop_lerobot.operator.simulated.walking import compute_miss, find, go_to, set_mode
+from xop_lerobot.tasks.person.mind import Doing, Mind
+from xop_lerobot.tasks.person.walking import compute_miss, find, go_to, set_mode
 
 POINTS = ("left_point", "right_point")
 APPROACHES = 6

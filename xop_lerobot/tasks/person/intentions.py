@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from xop_lerobot.core.registry import Registry
-from xop_lerobot.operator.simulated.box_pick_and_place import carry_box
-from xop_lerobot.operator.simulated.dual_point_touch import (
+from xop_lerobot.tasks.person.box_pick_and_place import carry_box
+from xop_lerobot.tasks.person.dual_point_touch import (
     reach_two_points,
     touch_two_points,
 )
-from xop_lerobot.operator.simulated.mind import Doing, Mind
-from xop_lerobot.operator.simulated.non_prehensile_transport import carry_toy, meet_hand
+from xop_lerobot.tasks.person.mind import Doing, Mind
+from xop_lerobot.tasks.person.non_prehensile_transport import carry_toy, meet_hand
 
 INTENTIONS: Registry[Callable[[Mind], Doing]] = Registry("task of the simulated operator")
 """What the person does for each task, as a generator over ticks."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.transforms import make_pose, quat_from_matrix
-from xop_lerobot.retarget.linearisation import find_site
+from xop_lerobot.retarget.model.linearisation import find_site
 
 _HINGE, _SLIDE, _FREE = (
     int(kind)

@@ -9,8 +9,8 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import quat_conjugate, quat_rotate, quat_yaw, wrap_angle
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import SIDES, TRUNK, relaxed_hands, stand_upright
-from xop_lerobot.operator.simulated.grasping import (
+from xop_lerobot.tasks.person.body import SIDES, TRUNK, relaxed_hands, stand_upright
+from xop_lerobot.tasks.person.grasping import (
     CARRY_SPEED,
     LIFTED,
     PRESS,
@@ -23,7 +23,7 @@ from xop_lerobot.operator.simulated.grasping import (
     lift,
     open_hands,
 )
-from xop_lerobot.operator.simulated.hands import (
+from xop_lerobot.tasks.person.hands import (
     HAND,
     compute_distance,
     compute_draw,
@@ -35,8 +35,8 @@ from xop_lerobot.operator.simulated.hands import (
     take_posture,
     tip_hands,
 )
-from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
-from xop_lerobot.operator.simulated.walking import compute_miss, find, glance, go_to, set_mode
+from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
+from xop_lerobot.tasks.person.walking import compute_miss, find, glance, go_to, set_mode
 
 PRESS_MORE = 0.01
 """How much more they press after a box has slipped [m]."""

@@ -13,13 +13,13 @@ from xop_lerobot.core.transforms import quat_from_yaw, quat_multiply
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.command_model import CommandModel
-from xop_lerobot.retarget.facing import FacingRule
-from xop_lerobot.retarget.footprint import Footprint
+from xop_lerobot.retarget.guidance.facing import FacingRule
+from xop_lerobot.retarget.guidance.footprint import Footprint
+from xop_lerobot.retarget.guidance.route import RoutePlanner
+from xop_lerobot.retarget.guidance.twist_room import TwistRoom
 from xop_lerobot.retarget.horizon_goals import hold_near, preview
+from xop_lerobot.retarget.model.command_model import CommandModel
 from xop_lerobot.retarget.posture_guide import HEAD, Served
-from xop_lerobot.retarget.route import RoutePlanner
-from xop_lerobot.retarget.twist_room import TwistRoom
 
 _LOOK_AHEAD = 1.6  # length of a way that is looked at: about a quarter turn [s]
 _STILL = 0.1  # speed of a goal under which it counts as standing still [m/s]

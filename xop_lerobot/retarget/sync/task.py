@@ -9,8 +9,8 @@ import mink
 import mujoco
 import numpy as np
 
-from xop_lerobot.retarget.sync_config import SyncConfig
-from xop_lerobot.retarget.sync_contacts import Contact, compute_height
+from xop_lerobot.retarget.sync.config import SyncConfig
+from xop_lerobot.retarget.sync.contacts import Contact, compute_height
 
 
 class SyncTask(mink.Task):

@@ -10,7 +10,7 @@ import numpy as np
 
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.sensing import Sensing
-from xop_lerobot.retarget.linearisation import Placement
+from xop_lerobot.retarget.model.linearisation import Placement
 
 
 class Parts(NamedTuple):

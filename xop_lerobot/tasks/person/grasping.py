@@ -10,8 +10,8 @@ import numpy as np
 
 from xop_lerobot.core.transforms import make_pose, quat_from_matrix, quat_yaw
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.body import SIDES
-from xop_lerobot.operator.simulated.hands import (
+from xop_lerobot.tasks.person.body import SIDES
+from xop_lerobot.tasks.person.hands import (
     compute_errors,
     compute_wrist,
     look_at_work,
@@ -20,7 +20,7 @@ from xop_lerobot.operator.simulated.hands import (
     reach,
     shift_hands,
 )
-from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
+from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 
 BESIDE = 0.06
 """Palms come so far beside the box before they close [m]."""

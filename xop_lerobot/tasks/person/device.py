@@ -6,9 +6,9 @@ from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.simulated.intentions import INTENTIONS, PREPARATIONS
-from xop_lerobot.operator.simulated.mind import Doing, GaveUp, Mind
 from xop_lerobot.operator.view import View
+from xop_lerobot.tasks.person.intentions import INTENTIONS, PREPARATIONS
+from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 
 LINGER = 1.5
 """Time for which the person stays after the end [s]."""

@@ -21,8 +21,8 @@ from xop_lerobot.core.transforms import (
     wrap_angle,
 )
 from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.simulated.person import Person
 from xop_lerobot.operator.view import SeenObject, View
+from xop_lerobot.tasks.person.person import Person
 
 WINDOW = 0.4
 """Time over which a person judges whether something moves [s]."""

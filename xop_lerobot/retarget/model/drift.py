@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.core.transforms import quat_yaw, wrap_angle
-from xop_lerobot.retarget.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel
 
 _MAX = np.array([0.3, 0.3, 0.4])  # [m/s, m/s, rad/s]; more is a stumble, not a drift
 

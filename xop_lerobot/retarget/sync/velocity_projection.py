@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from xop_lerobot.retarget.sync_config import SyncConfig
-from xop_lerobot.retarget.sync_contacts import Contact
+from xop_lerobot.retarget.sync.config import SyncConfig
+from xop_lerobot.retarget.sync.contacts import Contact
 
 _LEAST_PIVOT = 1e-15  # of a Cholesky factor
 

@@ -1,0 +1,1 @@
+"""Reference trajectory over the horizon, and where a base on wheels shall face."""

@@ -1,0 +1,1 @@
+"""What the planner knows: command model, kinematics, proposal and observers."""

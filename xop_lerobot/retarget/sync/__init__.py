@@ -1,0 +1,1 @@
+"""State synchronisation (Eq. 4): a contact-consistent state of noisy sensors."""
