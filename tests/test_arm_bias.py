@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from xop_lerobot.retarget.arms.bias import ArmBias
+from xop_lerobot.retarget.arms.contact import ArmBias
 
 DT = 0.04
 RANGE = np.array([[-1.0, 1.0], [-0.5, 2.0], [-3.0, 3.0]])

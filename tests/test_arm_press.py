@@ -8,10 +8,16 @@ import pytest
 
 from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_rpy
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.retarget.arms.bias import ArmBias
-from xop_lerobot.retarget.arms.hold import CARRYING_S, HOLDING_S, ArmHold
-from xop_lerobot.retarget.arms.load import ArmLoad
-from xop_lerobot.retarget.arms.yielding import MOST_SQUEEZE, MOST_WAY, ArmYield
+from xop_lerobot.retarget.arms.contact import (
+    CARRYING_S,
+    HOLDING_S,
+    MOST_SQUEEZE,
+    MOST_WAY,
+    ArmBias,
+    ArmHold,
+    ArmLoad,
+    ArmYield,
+)
 
 DT = 0.04
 NO_TURN = np.array([1.0, 0, 0, 0])

@@ -34,7 +34,7 @@ from xop_lerobot.retarget.costs import (
     TrackingCost,
     UprightCost,
 )
-from xop_lerobot.retarget.costs.lateral import compute_facing
+from xop_lerobot.retarget.costs.balance import compute_facing
 from xop_lerobot.retarget.obstacles import Obstacle
 
 K, H, NQ, NV, NA = 5, 4, 9, 8, 3

@@ -20,10 +20,13 @@ from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.background import BackgroundPlanner
-from xop_lerobot.retarget.delay import LatencyMeter, StatePredictor, predict_goal
-from xop_lerobot.retarget.plan import Plan
-from xop_lerobot.retarget.plan_track import GRACE_S, PlanTrack, StampedPlan
+from xop_lerobot.retarget.plan import GRACE_S, Plan, PlanTrack, StampedPlan
+from xop_lerobot.retarget.plan_follower import (
+    BackgroundPlanner,
+    LatencyMeter,
+    StatePredictor,
+    predict_goal,
+)
 from xop_lerobot.retarget.rollout import PolicyRollout
 from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig

@@ -9,7 +9,7 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.retarget.model.command_model import CommandModel
-from xop_lerobot.retarget.model.drift import DriftObserver
+from xop_lerobot.retarget.model.observers import DriftObserver
 
 DT = 0.04
 DRIFT = np.array([-0.08, 0.03, 0.07])

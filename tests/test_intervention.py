@@ -16,9 +16,9 @@ from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.candidates import Intervention, Verdict, judge
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs import CollisionCost
-from xop_lerobot.retarget.intervention import Intervention, Verdict, judge
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Plan, Status

@@ -9,9 +9,7 @@ import pytest
 
 from benchmarks.planner import SETTINGS, make_planner_table, measure_planners
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.kmppi import Kmppi
-from xop_lerobot.retarget.sampling import DRAWS
-from xop_lerobot.retarget.weighting import compute_effective_samples
+from xop_lerobot.retarget.kmppi import DRAWS, Kmppi, compute_effective_samples
 
 torch = pytest.importorskip("torch")
 peer = pytest.importorskip("pytorch_mppi.mppi", reason="the dev extra has pytorch-mppi")

@@ -23,10 +23,10 @@ from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.retarget.candidates import Intervention
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.horizon_goals import preview
-from xop_lerobot.retarget.intervention import Intervention
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan, Status

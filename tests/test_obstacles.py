@@ -20,8 +20,14 @@ from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs import CollisionCost
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.mpc import MpcRetargeter
-from xop_lerobot.retarget.obstacle_file import BadObstacles, load_obstacles
-from xop_lerobot.retarget.obstacles import SHAPES, Obstacle, ObstacleSet, make_obstacles
+from xop_lerobot.retarget.obstacles import (
+    SHAPES,
+    BadObstacles,
+    Obstacle,
+    ObstacleSet,
+    load_obstacles,
+    make_obstacles,
+)
 from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 

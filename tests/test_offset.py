@@ -17,7 +17,7 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.model.command_model import CommandModel
-from xop_lerobot.retarget.model.offset import OffsetObserver
+from xop_lerobot.retarget.model.observers import OffsetObserver
 from xop_lerobot.retarget.mpc import MpcRetargeter
 
 DT = 0.04

@@ -12,7 +12,7 @@ from scipy.stats import kstest
 from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 from xop_lerobot.morphology.tuning import KERNEL_MEANS, SAMPLINGS, MpcConfig
 from xop_lerobot.retarget.cem import Cem
-from xop_lerobot.retarget.kmppi import Kmppi
+from xop_lerobot.retarget.kmppi import DRAWS, Kmppi
 from xop_lerobot.retarget.optimizer import (
     OPTIMIZERS,
     Samples,
@@ -20,7 +20,6 @@ from xop_lerobot.retarget.optimizer import (
     build_optimizer,
     check_optimizer,
 )
-from xop_lerobot.retarget.sampling import DRAWS
 
 samplings = pytest.mark.parametrize("sampling", SAMPLINGS)
 BOUNDS = (np.array([-1.0, 0.2]), np.array([1.0, 0.9]))

@@ -10,7 +10,7 @@ from xop_lerobot.core.errors import BadValue
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.model.readings import Readings
+from xop_lerobot.retarget.model.linearisation import Readings
 from xop_lerobot.retarget.rollout import PolicyRollout
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}

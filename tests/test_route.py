@@ -18,9 +18,8 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.guidance.footprint import Footprint
 from xop_lerobot.retarget.guidance.guidance import Guidance, compute_times
-from xop_lerobot.retarget.guidance.route import RoutePlanner
+from xop_lerobot.retarget.guidance.route import Footprint, RoutePlanner
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle

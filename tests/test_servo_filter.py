@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.retarget.arms.servo_filter import ServoFilter, SteadyBody
+from xop_lerobot.retarget.arms.driver import ServoFilter, SteadyBody
 
 DT, LAG = 0.04, 0.1
 

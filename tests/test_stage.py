@@ -19,11 +19,11 @@ from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.view import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
-from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Retargeter
+from xop_lerobot.retarget.plan_follower import BackgroundPlanner
 from xop_lerobot.session import Session, get_session
 from xop_lerobot.tasks.dual_point_touch import TOLERANCE
 from xop_lerobot.tasks.furniture import place

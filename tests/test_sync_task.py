@@ -13,12 +13,12 @@ from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.sync.config import SyncConfig
 from xop_lerobot.retarget.sync.contacts import compute_equilibrium, make_contacts
-from xop_lerobot.retarget.sync.task import SyncTask
-from xop_lerobot.retarget.sync.velocity_projection import (
+from xop_lerobot.retarget.sync.filters import (
     ContactVelocity,
     compute_disagreement,
     project_velocity,
 )
+from xop_lerobot.retarget.sync.task import SyncTask
 
 
 class WheeledToy(toy_robot.Toy):

@@ -24,11 +24,10 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
-from xop_lerobot.retarget.background import BackgroundPlanner
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
-from xop_lerobot.retarget.plan import Plan, Retargeter
-from xop_lerobot.retarget.plan_track import StampedPlan
+from xop_lerobot.retarget.plan import Plan, Retargeter, StampedPlan
+from xop_lerobot.retarget.plan_follower import BackgroundPlanner
 from xop_lerobot.session import RobotInfo, TickRecord
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 

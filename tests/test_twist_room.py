@@ -6,7 +6,7 @@ import mujoco
 import pytest
 
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.retarget.guidance.twist_room import TwistRoom
+from xop_lerobot.retarget.guidance.guidance import TwistRoom
 
 TUCKED = {"arm_0": -0.05, "arm_1": 0.0, "arm_2": -0.2, "arm_3": -2.0}
 """Elbows at the body, forearms ahead, as for a box before the chest [rad]."""

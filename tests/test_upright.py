@@ -15,7 +15,7 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs import UprightCost
-from xop_lerobot.retarget.costs.upright import (
+from xop_lerobot.retarget.costs.tracking import (
     compute_side,
     compute_upright,
     compute_upright_error,

@@ -23,7 +23,7 @@ from xop_lerobot.plant.policy_loop import PolicyLoop, limit_action
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.changes import Change, apply_change, make_settings
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.retarget.costs.upright import compute_upright
+from xop_lerobot.retarget.costs.tracking import compute_upright
 from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan

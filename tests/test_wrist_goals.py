@@ -16,7 +16,7 @@ from xop_lerobot.core.transforms import (
     quat_from_yaw,
     rotation_error,
 )
-from xop_lerobot.retarget.arms.wrist_goals import compute_wrist_goals
+from xop_lerobot.retarget.arms.driver import compute_wrist_goals
 
 HEAD = make_pose(np.array([0.1, 0.2, 1.2]), quat_from_rpy(0.1, 0.2, 0.3))
 LEFT = make_pose(np.array([0.5, 0.4, 0.9]), quat_from_rpy(0.5, -0.2, 0.4))

@@ -28,7 +28,7 @@ from xop_lerobot.curate.retarget_config import read_settings, read_weights
 from xop_lerobot.evaluation.study_file import load_study
 from xop_lerobot.plant.config import NOISE_PRESETS
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.retarget.obstacle_file import load_obstacles
+from xop_lerobot.retarget.obstacles import load_obstacles
 
 
 @dataclass

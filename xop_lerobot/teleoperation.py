@@ -38,7 +38,7 @@ from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs.collision import Obstacle, make_obstacles
 from xop_lerobot.retarget.factory import make_retargeter, warn_of_obstacles, warn_of_scene
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
-from xop_lerobot.retarget.obstacle_file import load_obstacles
+from xop_lerobot.retarget.obstacles import load_obstacles
 from xop_lerobot.retarget.online import AppliedChange, OnlineSettings
 from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.presets import build_configs

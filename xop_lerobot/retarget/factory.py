@@ -16,8 +16,7 @@ from xop_lerobot.retarget.changes import make_settings
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.mpc import MpcRetargeter
-from xop_lerobot.retarget.obstacle_file import load_obstacles
-from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
+from xop_lerobot.retarget.obstacles import Obstacle, load_obstacles, make_obstacles
 from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.retarget.presets import build_configs
 

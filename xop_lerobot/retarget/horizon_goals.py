@@ -10,7 +10,7 @@ import numpy as np
 
 from xop_lerobot.core.state import Goal
 from xop_lerobot.core.transforms import make_pose, quat_multiply
-from xop_lerobot.retarget.costs.upright import make_level
+from xop_lerobot.retarget.costs.tracking import make_level
 
 
 def hold_near(goal: Goal, poses: Mapping[str, np.ndarray], reach: float) -> Goal:

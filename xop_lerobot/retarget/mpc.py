@@ -17,26 +17,23 @@ from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.candidates import Candidates
+from xop_lerobot.retarget.candidates import Candidates, Verdict, judge
 from xop_lerobot.retarget.config import CONSTRAINTS, RetargeterConfig, split_names
 from xop_lerobot.retarget.costs import CollisionCost, FallCost, SupportArea, make_costs
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.decision import DecisionSpace
-from xop_lerobot.retarget.guidance.footprint import Footprint
 from xop_lerobot.retarget.guidance.guidance import Guidance, compute_times
+from xop_lerobot.retarget.guidance.route import Footprint
 from xop_lerobot.retarget.horizon_goals import hold_level, preview
-from xop_lerobot.retarget.intervention import Verdict, judge
+from xop_lerobot.retarget.kmppi import compute_effective_samples
 from xop_lerobot.retarget.model.command_model import CommandModel
-from xop_lerobot.retarget.model.drift import DriftObserver
-from xop_lerobot.retarget.model.linearisation import find_sites_on
-from xop_lerobot.retarget.model.offset import OffsetObserver
-from xop_lerobot.retarget.model.readings import Readings
+from xop_lerobot.retarget.model.linearisation import Readings, find_sites_on
+from xop_lerobot.retarget.model.observers import DriftObserver, OffsetObserver
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
 from xop_lerobot.retarget.optimizer import SamplingOptimizer, build_optimizer
 from xop_lerobot.retarget.plan import Plan, Retargeter, Status
 from xop_lerobot.retarget.posture_guide import HEAD, PostureGuide, Served
 from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
-from xop_lerobot.retarget.weighting import compute_effective_samples
 
 
 class MpcRetargeter(Retargeter):

@@ -1,19 +1,291 @@
-"""Plans when it is due, in lock-step or in the background, and plays plans out."""
+"""Plans when it is due, in lock-step or in the background, and plays plans out.
+
+`BackgroundPlanner` runs a retargeter in a thread of its own: the newest plan, never a wait for it.
+`StatePredictor` computes where the robot will be when such a plan takes effect, and `predict_goal`
+where its goal will be.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+import logging
+import threading
+from collections import deque
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from xop_lerobot.core.state import Goal, RobotState
+from xop_lerobot.core.state import Goal, RobotState, freeze
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.background import BackgroundPlanner
-from xop_lerobot.retarget.delay import LatencyMeter, StatePredictor
+from xop_lerobot.retarget.horizon_goals import preview
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
-from xop_lerobot.retarget.plan import Retargeter
-from xop_lerobot.retarget.plan_track import StampedPlan
+from xop_lerobot.retarget.plan import PlanTrack, Retargeter, StampedPlan, overlay_arms
+from xop_lerobot.retarget.rollout import PolicyRollout
+
+logger = logging.getLogger(__name__)
+
+
+class _Job(NamedTuple):
+    state: RobotState
+    goal: Goal
+    ahead: int
+    epoch: int
+
+
+class BackgroundPlanner:
+    """Solves in a thread for the newest state and goal that were submitted.
+
+    A slow solve drops the states that came meanwhile: the next one starts from the newest,
+    predicted to when its plan will take effect. What a solve raises is raised in the caller, by
+    `submit`, `latest` and `at`, until the next `reset`.
+
+    Args:
+        retargeter: What solves; used by the thread alone from now on.
+        predictor: Predicts the state a plan starts from; None starts from the measured one.
+        threaded: False solves in `run_once` alone, for tests.
+    """
+
+    def __init__(
+        self,
+        retargeter: Retargeter,
+        predictor: StatePredictor | None = None,
+        *,
+        threaded: bool = True,
+    ) -> None:
+        self._retargeter, self._predictor = retargeter, predictor
+        self._ready = threading.Condition()
+        self._job: _Job | None = None
+        self._settings: dict[str, Any] | None = None
+        self._obstacles: tuple[Obstacle, ...] | None = None
+        self._track = PlanTrack()
+        self._reset_to: RobotState | None = None
+        self._epoch = self._solved_epoch = 0
+        self._running = True
+        self._failure: Exception | None = None
+        self._thread: threading.Thread | None = None
+        if threaded:
+            self._thread = threading.Thread(target=self._run, name="xop-planner", daemon=True)
+            self._thread.start()
+
+    def submit(self, state: RobotState, goal: Goal, ahead: int = 0) -> None:
+        """Ask for a plan from `state` to `goal`; replaces what has not been begun.
+
+        Args:
+            state: The robot now.
+            goal: The goal now.
+            ahead: Control steps after which the plan will take effect [20 ms].
+
+        Raises:
+            Exception: Whatever the last solve failed with.
+        """
+        with self._ready:
+            self._check()
+            self._job = _Job(state, goal, ahead, self._epoch)
+            self._ready.notify()
+
+    @property
+    def latest(self) -> StampedPlan | None:
+        """The newest plan since the last `reset`, None before the first.
+
+        Raises:
+            Exception: Whatever the last solve failed with.
+        """
+        with self._ready:
+            self._check()
+            return self._track.newest
+
+    def at(self, time: float) -> StampedPlan | None:
+        """The plan that counts at `time` [s] of the robot's clock, None before the first.
+
+        Raises:
+            Exception: Whatever the last solve failed with.
+        """
+        with self._ready:
+            self._check()
+            return self._track.at(time)
+
+    def configure(self, **settings: Any) -> None:
+        """Give the retargeter other settings (`MpcRetargeter.configure`) before its next solve."""
+        with self._ready:
+            self._settings = (self._settings or {}) | settings
+
+    def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
+        """Give the retargeter other obstacles (`Retargeter.set_obstacles`) before its next solve.
+
+        They are handed over in the solving thread, never in the middle of a solve.
+        """
+        with self._ready:
+            self._obstacles = obstacles
+
+    def reset(self, state: RobotState) -> None:
+        """Forget all plans, also the one being solved, and failures; start anew from `state`."""
+        with self._ready:
+            self._epoch += 1
+            self._job = self._failure = None
+            self._track.clear()
+            self._reset_to = state
+
+    def close(self) -> None:
+        """End the thread; may be called twice."""
+        with self._ready:
+            self._running = False
+            self._ready.notify()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _check(self) -> None:
+        """Raise what the last solve failed with; the caller holds the lock."""
+        if self._failure is not None:
+            raise self._failure
+
+    def _run(self) -> None:
+        while True:
+            with self._ready:
+                self._ready.wait_for(lambda: self._job is not None or not self._running)
+                if not self._running:
+                    return
+            self.run_once()
+
+    def run_once(self) -> None:
+        """Solve what was asked for last, if anything; the thread does nothing else."""
+        with self._ready:
+            job, self._job = self._job, None
+            reset_to, settings = self._reset_to, self._settings
+            self._settings = None
+            obstacles, self._obstacles = self._obstacles, None
+            track = self._track.copy()
+        if job is None:
+            return
+        try:
+            if settings is not None:
+                self._retargeter.configure(**settings)
+            if obstacles is not None:
+                self._retargeter.set_obstacles(obstacles)
+            if job.epoch != self._solved_epoch and reset_to is not None:
+                self._retargeter.reset(reset_to)
+                self._solved_epoch = job.epoch
+            plan = self._solve(job, track)
+        except Exception as failure:
+            logger.exception("the planner has failed")
+            with self._ready:
+                if job.epoch == self._epoch:
+                    self._failure, self._job = failure, None
+            return
+        with self._ready:
+            if job.epoch == self._epoch:
+                self._track.add(plan)
+
+    def _solve(self, job: _Job, track: PlanTrack) -> StampedPlan:
+        """Plan from where the robot will be when the plan takes effect."""
+        state, goal = job.state, job.goal
+        if self._predictor is not None:
+            state = self._predictor.predict(state, track, job.ahead)
+            goal = predict_goal(goal, state.time - job.state.time)
+        plan = self._retargeter.plan(state, goal)
+        period = self._retargeter.control_period(goal.mode)
+        return StampedPlan(plan, state.time, job.state.time, period)
+
+
+_GOAL_S = 0.3  # longest time over which a goal is assumed to keep its velocity [s]
+
+
+class LatencyMeter:
+    """Median time from the measurement to the first tick that can use its plan.
+
+    Args:
+        window: Number of plans that count.
+        longest: Latency beyond which the prediction does not follow [s].
+    """
+
+    def __init__(self, window: int = 15, longest: float = 0.3) -> None:
+        self._latencies: deque[float] = deque(maxlen=window)
+        self.longest = longest
+
+    def add(self, latency: float) -> None:
+        """Take one more [s]."""
+        self._latencies.append(latency)
+
+    def reset(self) -> None:
+        """Forget all."""
+        self._latencies.clear()
+
+    @property
+    def median(self) -> float:
+        """The median [s]; 0 before the first."""
+        return float(np.median(self._latencies)) if self._latencies else 0.0
+
+    @property
+    def steps(self) -> int:
+        """The median in control steps of 20 ms, at most `longest`."""
+        return round(min(self.median, self.longest) / POLICY_DT)
+
+
+class StatePredictor:
+    """Rolls a state forward under the commands that will be executed meanwhile.
+
+    One rollout, with the low-level policy and its memory in the loop, as the planner's own.
+
+    Args:
+        morphology: The robot.
+        rollout: The planner's rollouts; used by the thread that plans.
+    """
+
+    def __init__(self, morphology: Morphology, rollout: PolicyRollout) -> None:
+        self.morphology, self.rollout = morphology, rollout
+
+    def predict(self, state: RobotState, track: PlanTrack, steps: int) -> RobotState:
+        """Predict the state `steps` control steps later.
+
+        Args:
+            state: The robot now.
+            track: Plans that are played out meanwhile; without one the robot holds.
+            steps: How far [20 ms].
+
+        Returns:
+            The state then; `state` itself for no steps, or if the prediction diverges.
+        """
+        if steps < 1:
+            return state
+        space, names = self.morphology.command_space, self.morphology.arm_names
+        commands = np.empty((1, steps, len(space)))
+        arms = np.tile(state.arms, (1, steps, 1))
+        command, mode = state.command, state.mode
+        for step in range(steps):
+            time = state.time + step * POLICY_DT
+            plan = track.at(time)
+            wanted = command
+            if plan is not None:
+                wanted, mode = plan.get_command(time, space), plan.plan.mode
+                overlay_arms(arms[0, step], names, plan.get_arms(time))
+            command = space.limit(wanted, command, POLICY_DT, mode)
+            commands[0, step] = command
+        executed = (state.command, state.arms, state.mode) if self.morphology.ramps else None
+        prediction = self.rollout.predict(
+            state.qpos, state.qvel, state.memory, commands, arms, mode, executed
+        )
+        qpos, qvel = prediction.qpos[0, -1], prediction.qvel[0, -1]
+        if not (np.isfinite(qpos).all() and np.isfinite(qvel).all()):
+            return state
+        return dataclasses.replace(
+            state,
+            time=state.time + steps * POLICY_DT,
+            qpos=freeze(qpos),
+            qvel=freeze(qvel),
+            memory=freeze(prediction.memory[0]),
+            command=freeze(command),
+            arms=freeze(arms[0, -1]),
+            mode=mode,
+        )
+
+
+def predict_goal(goal: Goal, delay: float) -> Goal:
+    """Where the goal will be after `delay` [s], if it keeps its velocity."""
+    if delay <= 0:
+        return goal
+    ahead = preview(goal, tuple(goal.poses), np.array([delay]), _GOAL_S)
+    return dataclasses.replace(goal, poses={name: poses[0] for name, poses in ahead.items()})
 
 
 class PlanFollower:

@@ -25,7 +25,7 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.costs.support import SupportArea
+from xop_lerobot.retarget.costs.balance import SupportArea
 from xop_lerobot.retarget.model.command_model import CommandModel, find_joints_along
 from xop_lerobot.retarget.model.linearisation import Placement
 from xop_lerobot.retarget.model.posture import AT_REST_S, MISSED, Found, PostureSearch, Repertoire

@@ -1,24 +1,168 @@
-"""Arms and grippers of one tick: by inverse kinematics, or as the plan has decided."""
+"""Arms and grippers of one tick: by inverse kinematics, or as the plan has decided.
+
+Wrist goals are relative to the head where the body is not where the head's goal is
+(`compute_wrist_goals`); `ServoFilter` takes the noise of encoders out of joints on stiff servos.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.state import FRAMES, Goal, RobotState
-from xop_lerobot.core.transforms import make_pose, quat_from_matrix
+from xop_lerobot.core.transforms import (
+    compute_heading,
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_exp,
+    quat_from_matrix,
+    quat_from_yaw,
+    quat_multiply,
+    rotation_error,
+)
+from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.arms.bias import ArmBias
-from xop_lerobot.retarget.arms.hold import ArmHold
+from xop_lerobot.retarget.arms.contact import ArmBias, ArmHold, ArmLoad, ArmYield
 from xop_lerobot.retarget.arms.ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
-from xop_lerobot.retarget.arms.load import ArmLoad
-from xop_lerobot.retarget.arms.servo_filter import SteadyBody
-from xop_lerobot.retarget.arms.wrist_goals import compute_wrist_goals
-from xop_lerobot.retarget.arms.yielding import ArmYield
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from xop_lerobot.morphology.morphology import Morphology
+
+
+def compute_wrist_goals(
+    goals: Mapping[str, np.ndarray],
+    head: np.ndarray,
+    max_offset: float = 0.15,
+    max_turn: float = 0.4,
+) -> dict[str, np.ndarray]:
+    """Move wrist goals along with a head that is not at its goal.
+
+    A hand that works must be where the operator's is in the world, whatever the head does; a
+    robot that walks half a metre behind its goal must not stretch its arms ahead of itself. So
+    the goal in the world holds while it is within `max_offset` and `max_turn` of the goal that
+    goes with the robot's own head, and is held at that distance beyond. The change is continuous.
+
+    Args:
+        goals: Goal poses in the world by tracked frame. Shapes (7,).
+        head: The robot's head now. Shape (7,).
+        max_offset: Distance up to which the goal in the world holds [m].
+        max_turn: Turn up to which it holds [rad].
+
+    Returns:
+        Goals of every frame but the head. Shapes (7,).
+    """
+    wrists = {name: pose for name, pose in goals.items() if name != "head"}
+    if "head" not in goals:
+        return wrists
+    carry = pose_multiply(_level(head), pose_inverse(_level(goals["head"])))
+    return {
+        name: _approach(pose_multiply(carry, pose), pose, max_offset, max_turn)
+        for name, pose in wrists.items()
+    }
+
+
+def _level(pose: np.ndarray) -> np.ndarray:
+    """Place and heading of a pose, without its tilt. Shape (7,)."""
+    return make_pose(pose[:3], quat_from_yaw(compute_heading(pose[3:])))
+
+
+def _approach(start: np.ndarray, end: np.ndarray, max_offset: float, max_turn: float) -> np.ndarray:
+    """Go from one pose towards another, at most so far. Shape (7,)."""
+    offset = end[:3] - start[:3]
+    turn = rotation_error(end[3:], start[3:])
+    offset *= min(1.0, max_offset / max(float(np.linalg.norm(offset)), 1e-9))
+    turn *= min(1.0, max_turn / max(float(np.linalg.norm(turn)), 1e-9))
+    return make_pose(start[:3] + offset, quat_multiply(quat_exp(turn), start[3:]))
+
+
+class ServoFilter:
+    r"""Estimates where servos hold their joints, from what they were told and where they are seen.
+
+    A stiff servo follows its target s as a first-order lag, :math:`\dot m = (s - m)/T`, but for
+    an offset that changes slowly, such as a sag. So of the measured angle q only the slow part of
+    what the lag does not explain is believed,
+
+    .. math:: b \leftarrow b + (1 - e^{-dt/\tau})(q - m - b), \qquad \hat q = m + b.
+
+    White noise of q is damped by :math:`\sqrt{dt/2\tau}`, and no motion that was asked for is late.
+
+    Args:
+        lag: T of each joint [s]. Shape (n,).
+        time_constant: τ [s].
+    """
+
+    def __init__(self, lag: np.ndarray, *, time_constant: float = 0.4) -> None:
+        self.lag, self.time_constant = lag, time_constant
+        self.reset()
+
+    def reset(self) -> None:
+        """Start anew from the next measurement."""
+        self._model: np.ndarray | None = None
+        self._offset = np.zeros(len(self.lag))
+
+    def update(self, targets: np.ndarray, angles: np.ndarray, dt: float) -> np.ndarray:
+        """Estimate the angles of now.
+
+        Args:
+            targets: What the servos have been told since the last update [rad]. Shape (n,).
+            angles: Measured [rad]. Shape (n,).
+            dt: Time since then [s].
+
+        Returns:
+            Estimated angles [rad]. Shape (n,).
+        """
+        if self._model is None:
+            self._model, self._offset = targets.copy(), angles - targets
+            return angles.copy()
+        self._model += -np.expm1(-dt / self.lag) * (targets - self._model)
+        error = angles - self._model - self._offset
+        self._offset += -np.expm1(-dt / self.time_constant) * error
+        return self._model + self._offset
+
+
+class SteadyBody:
+    """The configuration that the arms hang on, with the joints of stiff servos filtered.
+
+    Args:
+        morphology: The robot; says whether its body is on stiff servos.
+        model: Any model of it, to find the joints.
+    """
+
+    def __init__(self, morphology: Morphology, model: mujoco.MjModel) -> None:
+        effects = morphology.effects if morphology.has_stiff_body else ()
+        held = [i for i, effect in enumerate(effects) if effect.acts is Acts.JOINT]
+        self._entries = np.array(held, dtype=int)
+        joints = [model.joint(effects[i].joint) for i in held]
+        self._address = np.array([int(joint.qposadr[0]) for joint in joints], dtype=int)
+        self._filter = ServoFilter(np.array([effects[i].lag_s for i in held]))
+
+    def reset(self) -> None:
+        """Start anew from the next configuration."""
+        self._filter.reset()
+
+    def update(self, qpos: np.ndarray, command: np.ndarray, dt: float) -> np.ndarray:
+        """Return the configuration of now.
+
+        Args:
+            qpos: As measured. Shape (nq,).
+            command: Command that is executed. Shape (k,).
+            dt: Time since the last update [s].
+        """
+        if not len(self._address):
+            return qpos
+        steady = qpos.copy()
+        angles = qpos[self._address]
+        steady[self._address] = self._filter.update(command[self._entries], angles, dt)
+        return steady
+
 
 BIAS_TIME = 1.5
 """Time in which offsets of the arms are learned [s]. With 0.5 s the arms of G1, which are soft,

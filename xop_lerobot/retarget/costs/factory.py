@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.costs.change import ChangeCost
+from xop_lerobot.retarget.costs.balance import (
+    FallCost,
+    LateralCost,
+    StanceCost,
+    SupportArea,
+    SupportCost,
+)
 from xop_lerobot.retarget.costs.collision import CollisionCost
-from xop_lerobot.retarget.costs.control import ControlCost
 from xop_lerobot.retarget.costs.cost import Cost
-from xop_lerobot.retarget.costs.fall import FallCost
-from xop_lerobot.retarget.costs.lateral import LateralCost
-from xop_lerobot.retarget.costs.stance import StanceCost
-from xop_lerobot.retarget.costs.support import SupportArea, SupportCost
-from xop_lerobot.retarget.costs.terminal import TerminalCost
-from xop_lerobot.retarget.costs.tracking import TrackingCost
-from xop_lerobot.retarget.costs.upright import UprightCost
+from xop_lerobot.retarget.costs.effort import ChangeCost, ControlCost
+from xop_lerobot.retarget.costs.tracking import TerminalCost, TrackingCost, UprightCost
 from xop_lerobot.retarget.static_load import StaticLoad
 
 if TYPE_CHECKING:

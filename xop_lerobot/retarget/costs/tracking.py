@@ -1,10 +1,17 @@
-"""Goal tracking cost."""
+"""Costs of tracking: goals over the horizon and at its end, and level palms; all of the paper."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.core.transforms import compute_heading_squares, sum_squares
+from xop_lerobot.core.transforms import (
+    compute_heading_squares,
+    make_pose,
+    quat_exp,
+    quat_multiply,
+    quat_rotate,
+    sum_squares,
+)
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 
@@ -38,3 +45,76 @@ def compute_tracking(poses: np.ndarray, goals: np.ndarray, weights: CostWeights)
     position = sum_squares(poses[..., :3] - goals[..., :3])
     turn, tilt = compute_heading_squares(goals[..., 3:], poses[..., 3:])
     return weights.position * position + weights.orientation * (turn + weights.tilt_share * tilt)
+
+
+class TerminalCost(Cost):
+    r""":math:`V_f = w_f\,l_{track}(\phi_\tau(x_H, a_{H-1}), G(t + H\,dt + \tau))`.
+
+    φ extrapolates the last predicted state by the `CommandModel`, as if its last command were
+    held for τ; with τ = 0 it is the paper's terminal cost. A horizon of 0.1 s alone cannot see
+    what a walking command is good for.
+    """
+
+    name = "terminal"
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        total = np.zeros(len(evaluation.qpos))
+        for name, goal in evaluation.terminal_goals.items():
+            total += compute_tracking(evaluation.terminal_poses[name], goal, evaluation.weights)
+        return evaluation.weights.terminal * total
+
+
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+class UprightCost(Cost):
+    r"""Mean over steps, and at the end of the extrapolation, of :math:`w_u\sum_f\|h_f\|^2`.
+
+    .. math:: h = R(\theta)\,R_{ee}(q)\,e_z - s\,e_z
+
+    of each hand that is to stay level: the paper's constraint of Version 2, as a penalty. The Z
+    of a wrist points out of the back of the hand; s is 1 where the operator's palm faces down,
+    and -1 where it faces up, as under a tray. For a small tilt α is
+    :math:`\|h\|^2 = 2(1 - \cos\alpha) \approx \alpha^2`. It leaves the heading of the hand free.
+    """
+
+    name = "upright"
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        total = np.zeros(len(evaluation.qpos))
+        for name in evaluation.upright:
+            sign = compute_side(evaluation.terminal_goals[name])
+            moving = compute_upright(evaluation.poses[name][:, 1:], sign).mean(axis=1)
+            total += moving + compute_upright(evaluation.terminal_poses[name], sign)
+        return evaluation.weights.upright * total
+
+
+def compute_side(pose: np.ndarray) -> np.ndarray:
+    """Side of a hand that is up: 1 for its back, -1 for its palm. Shape (..., 7) -> (...)."""
+    return np.where(quat_rotate(pose[..., 3:], _UP)[..., 2] < 0, -1.0, 1.0)
+
+
+def compute_upright(poses: np.ndarray, side: np.ndarray | float = 1.0) -> np.ndarray:
+    r""":math:`\|R e_z - s e_z\|^2` of poses. Shape (..., 7) -> (...)."""
+    return sum_squares(compute_upright_error(poses, side))
+
+
+def compute_upright_error(poses: np.ndarray, side: np.ndarray | float = 1.0) -> np.ndarray:
+    r""":math:`h = R e_z - s e_z` of poses. Shape (..., 7) -> (..., 3)."""
+    return quat_rotate(poses[..., 3:], _UP) - np.asarray(side)[..., None] * _UP
+
+
+def make_level(pose: np.ndarray) -> np.ndarray:
+    """Turn a pose by the least angle that makes its Z vertical. Shape (..., 7) -> (..., 7).
+
+    What the operator's hand asks for while it is to stay level: tracking its tilt too would
+    compete with the constraint. The side of the hand that is up stays up.
+    """
+    up = compute_side(pose)[..., None] * quat_rotate(pose[..., 3:], _UP)
+    x, y, z = np.moveaxis(up, -1, 0)
+    sine = np.hypot(x, y)
+    scale = np.arctan2(sine, z) / np.maximum(sine, 1e-12)
+    turn = np.stack([y * scale, -x * scale, np.zeros_like(x)], axis=-1)
+    return make_pose(pose[..., :3], quat_multiply(quat_exp(turn), pose[..., 3:]))

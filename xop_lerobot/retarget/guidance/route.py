@@ -1,17 +1,71 @@
-"""The way of a base that cannot go sideways to a goal that stands still: turn, drive, arrive."""
+"""Path of a base that cannot go sideways, to a goal at rest: turn, drive, arrive.
+
+`Footprint` is the part of the hull that goes with the base, and its clearance along a path.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from xop_lerobot.core.transforms import compute_heading, quat_yaw
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.guidance.footprint import Footprint
+from xop_lerobot.retarget.obstacles import Obstacle, ObstacleSet
+
+
+class Footprint:
+    """The hull's spheres that sit on the base itself, and the obstacles about them.
+
+    Args:
+        morphology: The robot.
+        model: Its planning model.
+        obstacles: What stands around it.
+    """
+
+    def __init__(
+        self, morphology: Morphology, model: mujoco.MjModel, obstacles: Iterable[Obstacle] = ()
+    ) -> None:
+        base = model.body(morphology.base_body).id
+        sites = [
+            (model.site(name), radius)
+            for name, radius in morphology.hull_points.items()
+            if model.site(name).bodyid[0] == base
+        ]
+        self._points = np.array([site.pos for site, _ in sites]).reshape(-1, 3)
+        self._points[:, 0] -= morphology.pivot
+        self._radii = np.array([radius for _, radius in sites])
+        self._height = float(morphology.standing_qpos()[2])
+        self.set_obstacles(obstacles)
+
+    def set_obstacles(self, obstacles: Iterable[Obstacle]) -> None:
+        """Take other obstacles."""
+        self._obstacles = ObstacleSet(obstacles)
+
+    def compute_clearance(self, axle: np.ndarray, headings: np.ndarray) -> np.ndarray:
+        """Distance of the base to the nearest obstacle, negative inside; infinite without any [m].
+
+        Args:
+            axle: Places of the middle of the axle [m]. Shape (n, 2).
+            headings: Headings there [rad]. Shape (n,).
+
+        Returns:
+            Shape (n,).
+        """
+        if not len(self._obstacles) or not len(self._points):
+            return np.full(len(axle), np.inf)
+        cosine, sine = np.cos(headings)[:, None], np.sin(headings)[:, None]
+        points = np.empty((len(axle), len(self._points), 3))
+        points[..., 0] = axle[:, None, 0] + cosine * self._points[:, 0] - sine * self._points[:, 1]
+        points[..., 1] = axle[:, None, 1] + sine * self._points[:, 0] + cosine * self._points[:, 1]
+        points[..., 2] = self._height + self._points[:, 2]
+        distances = self._obstacles.compute_distances(points) - self._radii[:, None]
+        return distances.min(axis=(1, 2))
+
 
 _DT = 0.04  # step of the simulated way [s]
 _MAX_SPEED, _ACCELERATION, _BRAKING = 1.2, 1.5, 1.0  # [m/s], [m/s²], [m/s²]

@@ -19,7 +19,7 @@ from xop_lerobot.core.transforms import (
     rotation_error,
     sum_squares,
 )
-from xop_lerobot.retarget.costs.support import SupportArea
+from xop_lerobot.retarget.costs.balance import SupportArea
 from xop_lerobot.retarget.model.command_model import CommandModel
 from xop_lerobot.retarget.model.linearisation import Placement
 from xop_lerobot.retarget.model.proposal import KinematicProposal, ProposalWeights, Solution

@@ -14,8 +14,7 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import quat_rotate, quat_yaw
 from xop_lerobot.morphology.tuning import CostWeights
-from xop_lerobot.retarget.costs.lateral import compute_lateral
-from xop_lerobot.retarget.costs.support import SupportArea
+from xop_lerobot.retarget.costs.balance import SupportArea, compute_lateral
 from xop_lerobot.retarget.model.command_model import CommandModel
 from xop_lerobot.retarget.model.heading import linearise_heading
 from xop_lerobot.retarget.model.linearisation import Linearisation, find_site

@@ -14,17 +14,16 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.core.state import freeze
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.sync.config import SyncConfig, SyncStatus
-from xop_lerobot.retarget.sync.contacts import make_contacts
-from xop_lerobot.retarget.sync.sensor_filter import SensorFilter
-from xop_lerobot.retarget.sync.stance import StanceMemory
-from xop_lerobot.retarget.sync.task import SyncTask
-from xop_lerobot.retarget.sync.velocity_bias import VelocityBias
-from xop_lerobot.retarget.sync.velocity_projection import (
+from xop_lerobot.retarget.sync.contacts import StanceMemory, make_contacts
+from xop_lerobot.retarget.sync.filters import (
     ContactVelocity,
+    SensorFilter,
+    VelocityBias,
     compute_disagreement,
     project_velocity,
     solve_positive,
 )
+from xop_lerobot.retarget.sync.task import SyncTask
 
 logger = logging.getLogger(__name__)
 

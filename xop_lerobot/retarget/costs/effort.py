@@ -1,4 +1,4 @@
-"""Cost of changing the command."""
+"""Costs of effort: control (paper) and change of the command (ours)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,27 @@ import numpy as np
 
 from xop_lerobot.core.transforms import sum_squares
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+
+
+class ControlCost(Cost):
+    r"""Mean over steps of :math:`w_a\|(a_k - a_{ref})/s\|^2`, s half the range of each entry.
+
+    With the absolute command of the paper the term pulls a standing height towards zero; with
+    the kinematic proposal as reference it costs only what is done beyond it.
+
+    Args:
+        scale: Half the range of each command entry. Shape (k,).
+    """
+
+    name = "control"
+
+    def __init__(self, scale: np.ndarray) -> None:
+        self.scale = scale
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        effort = (evaluation.commands - evaluation.reference) / self.scale
+        return evaluation.weights.control * sum_squares(effort).mean(-1)
 
 
 class ChangeCost(Cost):

@@ -1,0 +1,342 @@
+"""Costs of balance: support, stance, fall, and the heading of a base that cannot go sideways.
+
+`StanceCost` is the paper's contact point term; the others are ours.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.transforms import quat_yaw, sum_squares, wrap_angle
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.retarget.static_load import StaticLoad
+
+GRAVITY = 9.81
+_VELOCITY_STEPS = 3  # control steps at the end of the horizon that give the velocity
+
+
+class SupportArea:
+    """The area on which a robot stands, shrunk by a margin.
+
+    Args:
+        corners: Corners (x, y) in the base's frame, counterclockwise [m]. Shape (c, 2).
+        resting: Where the centre of mass is at rest, in the base's frame [m]. Shape (2,).
+        margin: Distance that is kept from every edge [m].
+        free: Distance from rest up to which a lean costs nothing: arms reach, chests bend [m].
+    """
+
+    def __init__(
+        self,
+        corners: tuple[tuple[float, float], ...],
+        resting: tuple[float, float] = (0.0, 0.0),
+        margin: float = 0.1,
+        free: float = 0.05,
+    ) -> None:
+        points = np.array(corners, dtype=float)
+        edges = np.roll(points, -1, axis=0) - points
+        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)  # outwards
+        self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        self._offsets = (self._normals * points).sum(1) - margin
+        self._resting = np.array(resting)
+        self._free = free
+
+    def compute_excess(self, base: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Distances of points beyond each edge, 0 inside [m]. (..., 7), (..., 2) -> (..., c)."""
+        return self.compute_excess_in_base(_to_base(base, points))
+
+    def compute_excess_in_base(self, places: np.ndarray) -> np.ndarray:
+        """`compute_excess` of places in the base's frame [m]. (..., 2) -> (..., c)."""
+        return np.maximum(places @ self._normals.T - self._offsets, 0)
+
+    def compute_lean(
+        self, base: np.ndarray, com: np.ndarray, balance: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Place of the centre of mass beyond the free circle about where it rests [m].
+
+        That is `balance`, shape (2,), or where it rests as the robot stands.
+
+        Shapes (..., 7), (..., 2) -> (..., 2).
+        """
+        offset = _to_base(base, com) - (self._resting if balance is None else balance)
+        length = np.sqrt(sum_squares(offset))
+        share = np.maximum(0, 1 - self._free / np.maximum(length, 1e-9))
+        return offset * share[..., None]
+
+    def linearise_excess(
+        self, base: np.ndarray, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`compute_excess` of one point, and its derivative by the place in the base's frame.
+
+        Shapes (7,), (2,) -> (c,), (c, 2).
+        """
+        excess = self._normals @ _to_base(base, point) - self._offsets
+        outside = excess > 0
+        return np.where(outside, excess, 0.0), self._normals * outside[:, None]
+
+    def linearise_lean(
+        self, base: np.ndarray, com: np.ndarray, balance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """`compute_lean` of one place, and its derivative by the place in the base's frame.
+
+        Shapes (7,), (2,) -> (2,), (2, 2).
+        """
+        offset = _to_base(base, com) - (self._resting if balance is None else balance)
+        length = float(np.linalg.norm(offset))
+        if length <= self._free:
+            return np.zeros(2), np.zeros((2, 2))
+        along = offset / length
+        share = 1 - self._free / length
+        # Radially the length beyond the circle changes, across only the direction does.
+        return offset * share, share * np.eye(2) + (1 - share) * np.outer(along, along)
+
+
+def _to_base(base: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points in the base's place and heading. (..., 7), (..., 2) -> (..., 2)."""
+    yaw = quat_yaw(base[..., 3:])
+    dx, dy = points[..., 0] - base[..., 0], points[..., 1] - base[..., 1]
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    return np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=-1)
+
+
+class SupportCost(Cost):
+    r"""Squared distances beyond the shrunk support area, of three points.
+
+    .. math::
+
+        z = c_{xy} - \frac{c_z}{g}\,\ddot c_{xy}, \qquad
+        \xi = c_{xy} + \sqrt{c_z / g}\;\dot c_{xy}
+
+    with c the centre of mass and its acceleration the mean over the horizon, from finite
+    differences. On flat ground the robot tips where the zero-moment point z leaves the area
+    (Vukobratović and Borovac, 2004). The horizon is too short to see a tipping that has begun:
+    ξ, at its end and with the velocity relative to the base, is where the centre of mass would
+    come to rest over a pivot if all joints stopped (the capture point; Pratt et al., 2006).
+    The third is the centre of mass itself at the end of the extrapolation, where the robot shall
+    be able to stand still. There its squared distance beyond a free circle about where it rests
+    counts too, with the weight `lean`: a mobile robot shall drive after its goal, not bend; and
+    the static torques there beyond their share of what motors can, squared, with the weight
+    `load`: a torso whose servos give way folds. The paper has no such term.
+
+    Args:
+        area: The support area, None for a robot whose policy keeps the balance.
+        load: What joints bear of the weight above them; None where that does not count.
+    """
+
+    name = "support"
+
+    def __init__(self, area: SupportArea | None, load: StaticLoad | None = None) -> None:
+        self.area, self.load = area, load
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        loaded = np.zeros(len(evaluation.qpos))
+        if self.load is not None:
+            beyond = self.load.compute_excess(evaluation.terminal_qpos)
+            loaded = evaluation.weights.load * sum_squares(beyond)
+        if self.area is None:
+            return loaded
+        com, dt = evaluation.com[:, 1:], evaluation.dt
+        velocity = np.diff(com[..., :2], axis=1) / dt
+        acceleration = np.zeros((len(com), 2))  # two steps or less do not tell
+        if velocity.shape[1] > 1:
+            span = (velocity.shape[1] - 1) * dt
+            acceleration = (velocity[:, -1] - velocity[:, 0]) / span
+        zmp = com[..., :2] - com[..., 2:] / GRAVITY * acceleration[:, None]
+        excess = sum_squares(self.area.compute_excess(evaluation.qpos[:, 1:, :7], zmp))
+        excess = excess.mean(-1) + sum_squares(self._compute_capture_excess(evaluation))
+        base, com = evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
+        excess += sum_squares(self.area.compute_excess(base, com))
+        lean = sum_squares(self.area.compute_lean(base, com, evaluation.balance))
+        return evaluation.weights.support * excess + evaluation.weights.lean * lean + loaded
+
+    def _compute_capture_excess(self, evaluation: Evaluation) -> np.ndarray:
+        """Distances of the capture point beyond each edge at the end of the horizon. (K, c)."""
+        assert self.area is not None
+        steps = min(_VELOCITY_STEPS, evaluation.com.shape[1] - 1)
+        com, base = evaluation.com[:, -1 - steps :], evaluation.qpos[:, -1 - steps :, :7]
+        place = _to_base(base, com[..., :2])
+        velocity = (place[:, -1] - place[:, 0]) / (steps * evaluation.dt)
+        capture = place[:, -1] + np.sqrt(np.maximum(com[:, -1, 2:], 0) / GRAVITY) * velocity
+        return self.area.compute_excess_in_base(capture)
+
+
+class StanceCost(Cost):
+    r"""Mean over steps of :math:`w_s \sum_{i \in C_k} \|\dot p^c_{i,k}\|^2`.
+
+    Points come in groups that touch the ground together (the four of a foot); each group counts
+    by the mean of its points. C holds every group in stationary mode, and in mobile mode the
+    lowest group of each step, the standing foot. On wheels, which must roll, only stationary
+    mode counts.
+
+    Args:
+        groups: Sites of each group of contact points.
+        wheeled: Whether the robot stands on wheels.
+    """
+
+    name = "stance"
+
+    def __init__(self, groups: tuple[tuple[str, ...], ...], wheeled: bool) -> None:
+        self.groups, self.wheeled = groups, wheeled
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        if self.wheeled and evaluation.mode is Mode.MOBILE:
+            return np.zeros(len(evaluation.qpos))
+        speeds = []
+        for group in self.groups:
+            velocities = np.array([evaluation.velocities[site] for site in group])
+            speeds.append(sum_squares(velocities[:, :, 1:]).mean(0))  # (K, H)
+        speed = np.array(speeds)  # (groups, K, H)
+        if evaluation.mode is Mode.STATIONARY:
+            active = speed.sum(axis=0)
+        else:
+            active = np.take_along_axis(speed, self._find_lowest(evaluation)[None], axis=0)[0]
+        return evaluation.weights.stance * active.mean(axis=1)
+
+    def _find_lowest(self, evaluation: Evaluation) -> np.ndarray:
+        """The lowest group of each step. Shape (K, H), int."""
+        heights = []
+        for group in self.groups:
+            points = np.array([evaluation.points[site][:, 1:, 2] for site in group])
+            heights.append(points.mean(0))
+        return np.array(heights).argmin(axis=0)
+
+
+class FallCost(Cost):
+    r"""Mean over steps of :math:`w_{fall}(\max(0, \alpha - \alpha_s)^2 + \max(0, z_s - z)^2)`.
+
+    α is the tilt of the base and z its height. The safe tilt is halfway between the one at which
+    the robot rests under the executed command and a fall; the safe height is the one at which
+    three quarters of the margin to a fall are used up, or halfway between a fall and the lowest
+    height that can be commanded. So the cost is zero in ordinary motion, also of a robot that
+    squats. The paper has no such term; its predicted falls show up in the tracking cost alone.
+
+    Args:
+        tilt: Tilt at which the robot counts as fallen [rad].
+        height: Base height under which it counts as fallen [m].
+        standing_height: Base height at rest [m].
+        lowest: Lowest base height that can be commanded [m].
+        compute_rest_tilt: Tilt at which a base rests under a command in a mode [rad]; 0 by default.
+    """
+
+    name = "fall"
+
+    def __init__(
+        self,
+        tilt: float,
+        height: float,
+        standing_height: float,
+        lowest: float = math.inf,
+        compute_rest_tilt: Callable[[np.ndarray, Mode], float] = lambda _command, _mode: 0.0,
+    ) -> None:
+        self.tilt, self.height = tilt, height
+        self._compute_rest_tilt = compute_rest_tilt
+        self.safe_height = min(height + (standing_height - height) / 4, (height + lowest) / 2)
+
+    def find_falls(self, evaluation: Evaluation) -> np.ndarray:
+        """Which samples count as fallen at some predicted step. Shape (K,), bool."""
+        base = evaluation.qpos[:, 1:, :7]
+        fallen = (_compute_upright(base) < math.cos(self.tilt)) | (base[..., 2] < self.height)
+        return np.any(fallen, axis=1)
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        base = evaluation.qpos[:, 1:, :7]
+        tilt = np.arccos(np.clip(_compute_upright(base), -1, 1))
+        rest_tilt = self._compute_rest_tilt(evaluation.executed, evaluation.mode)
+        safe_tilt = (self.tilt + rest_tilt) / 2
+        excess = np.square(np.maximum(0, tilt - safe_tilt))
+        excess += np.square(np.maximum(0, self.safe_height - base[..., 2]))
+        return evaluation.weights.fall * excess.mean(axis=1)
+
+
+def _compute_upright(base: np.ndarray) -> np.ndarray:
+    """Cosine of the angle of the base's Z to the vertical. Shape (..., 7) -> (...)."""
+    return 1 - 2 * (base[..., 4] ** 2 + base[..., 5] ** 2)
+
+
+_LOOKING = 0.1  # speed at which the way to go and where the goal looks count alike [m/s]
+_REST, _FULL = 0.08, 0.2  # speeds of the head from which on the base is to face so [m/s]
+_TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
+_BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
+_MAX_TWIST = 1.9  # twist of the waist beyond which the base does not face so [rad]
+_TOO_TWISTED = 10.0  # how much a twist beyond it counts
+
+
+def compute_facing(
+    heading: float, velocity: np.ndarray, look: float, speed: float, room: float = math.inf
+) -> np.ndarray:
+    r"""Compute where a base on wheels shall face, and how much that counts.
+
+    .. math:: \psi^\pm = \angle(\pm u + u_0\,(\cos\psi_g, \sin\psi_g))
+
+    for driving forwards (+) and backwards (-), with u the velocity that takes the axle to where
+    it will be when the robot stands straight at its goal, and :math:`\psi_g` where the goal
+    looks; of the two that with less of a turn and less of a twist is taken, and none that twists
+    the waist further than it can: who walks ahead is never followed backwards. Far from its goal
+    the base lines up with the way there, near it with the goal, so that driving on closes in on
+    the line through the goal, as in parking (path following of a unicycle; Siciliano et al.,
+    Robotics, 2009, section 11.6). The last centimetres are left to the waist.
+
+    Args:
+        heading: Heading of the base [rad].
+        velocity: The axle's velocity u [m/s]. Shape (2,).
+        look: Heading of the goal [rad].
+        speed: Speed at which what is tracked would be at its goal in time [m/s].
+        room: How far the arms let the waist twist [rad].
+
+    Returns:
+        Direction in the world, as long as it counts: 0 to 1. Shape (2,).
+    """
+    ahead = _LOOKING * np.array([math.cos(look), math.sin(look)])
+    best, least, most = look, math.inf, min(_MAX_TWIST, room)
+    for sign, effort in ((1.0, 0.0), (-1.0, _BACKWARDS)):
+        x, y = sign * velocity + ahead
+        facing = math.atan2(y, x)
+        effort += abs(float(wrap_angle(facing - heading)))  # noqa: PLW2901
+        twist = abs(float(wrap_angle(facing - look)))
+        effort += _TWIST * twist + _TOO_TWISTED * max(twist - most, 0.0)  # noqa: PLW2901
+        if effort < least:
+            best, least = facing, effort
+    share = min(max((speed - _REST) / (_FULL - _REST), 0.0), 1.0)
+    return share * np.array([math.cos(best), math.sin(best)])
+
+
+def compute_lateral(base: np.ndarray, facing: np.ndarray) -> np.ndarray:
+    """Angle of bases to where they shall face, times how much it counts [rad].
+
+    Shapes (..., 7), (2,) -> (...).
+    """
+    angle = math.atan2(facing[1], facing[0])
+    return math.hypot(*facing) * wrap_angle(angle - quat_yaw(base[..., 3:]))
+
+
+class LateralCost(Cost):
+    r""":math:`w_n\,s^2(\psi^* - \psi)^2`, the heading of a base that cannot go sideways.
+
+    :math:`\psi^*` is where it shall face and s how much that counts (`compute_facing`), ψ its
+    heading at the end of the extrapolation. A head that sits behind the axle can be moved
+    sideways by turning the base, which is right for a few centimetres at rest. Done while
+    driving it turns the base away from where it drives, ever further (the zero dynamics of an
+    offset point are unstable ahead; Siciliano et al., Robotics, 2009, section 11.5), until the
+    waist is at its limit. Only mobile robots on wheels have the term.
+
+    Args:
+        nonholonomic: Whether the robot drives but cannot go sideways.
+    """
+
+    name = "lateral"
+
+    def __init__(self, nonholonomic: bool) -> None:
+        self.nonholonomic = nonholonomic
+
+    def compute(self, evaluation: Evaluation) -> np.ndarray:
+        """Cost of every sample. Shape (K,)."""
+        if not self.nonholonomic:
+            return np.zeros(len(evaluation.qpos))
+        lateral = compute_lateral(evaluation.terminal_qpos[:, :7], evaluation.facing)
+        return evaluation.weights.lateral * np.square(lateral)
