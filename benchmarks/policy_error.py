@@ -15,7 +15,7 @@ import numpy as np
 from xop_lerobot.core.errors import BadDataset, BadValue
 from xop_lerobot.core.transforms import pose_inverse, pose_multiply
 from xop_lerobot.curate.source import EpisodeEntry, Source
-from xop_lerobot.evaluation.intervals import Interval, compute_mean_interval
+from xop_lerobot.evaluation.summary import Interval, compute_mean_interval
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.config import SimulationConfig

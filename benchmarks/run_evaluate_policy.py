@@ -62,7 +62,7 @@ def evaluate(rollouts: dict[str, Hands], at: float) -> dict[str, Any]:
         compute_margin,
         stand_still,
     )
-    from xop_lerobot.evaluation.intervals import compute_mean_interval
+    from xop_lerobot.evaluation.summary import compute_mean_interval
 
     first = next(iter(rollouts))
     setting, episodes = rollouts[first].setting, rollouts[first].episodes

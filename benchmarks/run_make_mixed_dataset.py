@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     import mujoco
 
     from lerobot_robot_xop.xop_robot import XopRobot
-    from xop_lerobot.operator.view import SeenObject
+    from xop_lerobot.operator.display import SeenObject
     from xop_lerobot.plant.simulation import Simulation
     from xop_lerobot.recording.dataset import XopDataset
 

@@ -22,12 +22,11 @@ from benchmarks.person_comparison import simulate_frames
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import XopError
 from xop_lerobot.core.transforms import make_pose
-from xop_lerobot.operator.clutch import Clutch
-from xop_lerobot.operator.clutch import Wish as ClutchWish
 from xop_lerobot.operator.dataset_recording import is_dataset, load_dataset_recording
+from xop_lerobot.operator.engagement import Clutch
+from xop_lerobot.operator.engagement import Wish as ClutchWish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.gestures import GestureConfig
-from xop_lerobot.operator.hands import Hands
+from xop_lerobot.operator.gestures import GestureConfig, Hands
 from xop_lerobot.operator.recording import Recording, load_recording
 
 RATE = 50

@@ -33,6 +33,7 @@ from benchmarks.tracking_setup import (
 from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import (
+    compute_heading,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -44,7 +45,6 @@ from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation

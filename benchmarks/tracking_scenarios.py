@@ -14,6 +14,7 @@ import numpy as np
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import (
+    compute_heading,
     make_pose,
     quat_from_yaw,
     quat_multiply,
@@ -26,7 +27,6 @@ from xop_lerobot.evaluation.bench import (
     make_curve,
     move_from,
 )
-from xop_lerobot.operator.interpolation import compute_heading
 
 WALK_SPEED = 0.5
 """Speed of the direct path that arrival times are compared with [m/s]."""

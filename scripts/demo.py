@@ -147,7 +147,8 @@ def show(demos: list[Demo], roots: list[Path], out: Path) -> None:
     os.environ.update(build_environment(out, os.environ))
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from xop_lerobot.evaluation import strip, summary
+    from xop_lerobot.evaluation import film as films
+    from xop_lerobot.evaluation import summary
     from xop_lerobot.morphology.morphology import make_morphology
 
     summaries = []
@@ -162,11 +163,11 @@ def show(demos: list[Demo], roots: list[Path], out: Path) -> None:
                 make_morphology(demo.robot),
             )
         )
-        cameras = {name: strip.read_camera(dataset, name) for name in CAMERAS}
+        cameras = {name: films.read_camera(dataset, name) for name in CAMERAS}
         base = out / f"{demo.robot}"
-        strip.write_strip(base.with_suffix(".png"), cameras, FPS)
-        strip.write_video(base.with_suffix(".mp4"), strip.build_film(cameras, FPS), FPS)
-        strip.write_gif(base.with_suffix(".gif"), strip.build_film(cameras, FPS), FPS)
+        films.write_strip(base.with_suffix(".png"), cameras, FPS)
+        films.write_video(base.with_suffix(".mp4"), films.build_film(cameras, FPS), FPS)
+        films.write_gif(base.with_suffix(".gif"), films.build_film(cameras, FPS), FPS)
         print(f"{demo.robot}: dataset {_shorten(root)}", end="")
         print(f", pictures {_shorten(base)}.png, .mp4 and .gif")
     print(f"\n{summary.format_table(summaries)}")

@@ -19,7 +19,7 @@ import numpy as np
 
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.operator.axes import WORLD
-from xop_lerobot.operator.devices.avp_protocol import AXES
+from xop_lerobot.operator.devices.avp import AXES
 from xop_lerobot.operator.webxr.protocol import GRIPS, PARALLEL
 
 PLACES = {

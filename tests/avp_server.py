@@ -12,7 +12,7 @@ import numpy as np
 from ports import find_port
 
 from xop_lerobot.core.transforms import quat_rotate
-from xop_lerobot.operator.devices.avp_protocol import (
+from xop_lerobot.operator.devices.avp import (
     AXES,
     ENTRIES,
     INDEX_TIP,

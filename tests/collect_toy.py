@@ -12,8 +12,8 @@ import toy_robot  # noqa: F401  registers the robot
 
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES
+from xop_lerobot.operator.display import SeenObject
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.view import SeenObject
 from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
 
 

@@ -19,7 +19,7 @@ from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 
 from benchmarks.curate_synthetic import make_dataset
-from xop_lerobot.recording.schedule import keep_schedule
+from xop_lerobot.recording.writer import keep_schedule
 
 SIZE = 32
 

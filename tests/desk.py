@@ -9,11 +9,11 @@ from collections.abc import Callable
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.operator.clutch import Clutch
-from xop_lerobot.operator.clutch import Wish as ClutchWish
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, Wish
+from xop_lerobot.operator.engagement import Clutch
+from xop_lerobot.operator.engagement import Wish as ClutchWish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import Gesture, GestureConfig, GestureReader
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import (
+    compute_heading,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -28,8 +29,7 @@ from xop_lerobot.operator.alignment import (
     is_lost,
 )
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.goal_velocity import GoalVelocity, GoalVelocityConfig
-from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.goal import GoalVelocity, GoalVelocityConfig
 
 ROBOT_HEIGHT = 1.27
 angles = st.floats(-3.0, 3.0)

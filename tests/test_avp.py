@@ -18,8 +18,7 @@ from swaying import make_person
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.transforms import quat_rotate
 from xop_lerobot.operator.devices import DeviceConfig, live, make_device
-from xop_lerobot.operator.devices.avp import AvpDevice
-from xop_lerobot.operator.devices.avp_protocol import HandUpdate, make_request, parse_update
+from xop_lerobot.operator.devices.avp import AvpDevice, HandUpdate, make_request, parse_update
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.pairing import MAX_RATE, RateLimit
 

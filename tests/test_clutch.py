@@ -11,9 +11,9 @@ import pytest
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import make_pose, quat_exp, quat_multiply
-from xop_lerobot.operator.clutch import Clutch, ClutchConfig, Wish
+from xop_lerobot.operator.engagement import Clutch, ClutchConfig, Wish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.hand_blend import HandBlend
+from xop_lerobot.operator.goal import HandBlend
 from xop_lerobot.operator.recording import load_recording
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[2] / "shared"))

@@ -24,8 +24,8 @@ import xop_lerobot.collect.folder as folder_module
 from xop_lerobot.collect.cli import collect, main, make_parser, parse_arguments
 from xop_lerobot.collect.config import CollectConfig
 from xop_lerobot.collect.folder import CollectFolder, FolderTaken, OtherSettings
-from xop_lerobot.collect.jobs import WorkerFailed
 from xop_lerobot.collect.merge import merge_attempts
+from xop_lerobot.collect.run import WorkerFailed
 from xop_lerobot.collect.worker import Collector
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.operator.devices import DeviceConfig, make_device

@@ -14,8 +14,14 @@ import pytest
 
 from xop_lerobot.control import client as control_client
 from xop_lerobot.control import server as control_server
-from xop_lerobot.control.client import ControlClient, NoSession, Refused
-from xop_lerobot.control.keys import PRESET_KEYS, TOGGLE_KEYS, press
+from xop_lerobot.control.client import (
+    PRESET_KEYS,
+    TOGGLE_KEYS,
+    ControlClient,
+    NoSession,
+    Refused,
+    press,
+)
 from xop_lerobot.control.protocol import MAX_LINE, find_runtime_dir, find_socket
 from xop_lerobot.control.server import ControlFault, ControlServer
 from xop_lerobot.core.errors import BadValue

@@ -16,8 +16,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_rows import get_row
 
 from xop_lerobot.curate.cli import main
-from xop_lerobot.curate.packets import is_whole_av1, is_whole_nal
-from xop_lerobot.curate.video import index_video
+from xop_lerobot.curate.video import index_video, is_whole_av1, is_whole_nal
 
 LENGTHS = (37, 25, 44)
 CODECS = {"h264": {"vcodec": "h264", "preset": "ultrafast"}, "hevc": {"vcodec": "hevc"}, "av1": {}}

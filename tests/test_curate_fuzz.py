@@ -21,10 +21,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lerobot.datasets import LeRobotDataset
 
-from xop_lerobot.curate.cli import main
+from xop_lerobot.curate.cli import VERBS, main
 from xop_lerobot.curate.source import Source
 from xop_lerobot.curate.survey import survey
-from xop_lerobot.curate.verbs import VERBS
 from xop_lerobot.recording.facts import CONFIG_FILE, EPISODES_FILE
 
 EPISODES, FRAMES = 3, 30

@@ -19,7 +19,7 @@ from lerobot.datasets import LeRobotDataset
 from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.curate.cli import main
 from xop_lerobot.curate.expression import Expression
-from xop_lerobot.curate.figures import FIGURES
+from xop_lerobot.curate.measures import FIGURES
 from xop_lerobot.curate.source import Source
 from xop_lerobot.curate.survey import survey
 from xop_lerobot.recording.columns import HEALTH_NAMES

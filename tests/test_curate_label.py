@@ -13,11 +13,11 @@ from curate_recorded import load, read_rows, record_toy
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.curate.cli import main
-from xop_lerobot.curate.frame_rules import FrameRules, list_entries
-from xop_lerobot.curate.label_session import LabelSession
+from xop_lerobot.curate.label import FrameRules, list_entries
 from xop_lerobot.curate.label_views import LabelWindow, ask_in_terminal, read_films
 from xop_lerobot.curate.labels import (
     Label,
+    LabelSession,
     list_runs,
     number_frames,
     read_labels,

@@ -17,12 +17,11 @@ from curate_data import compute_digests, make_foreign, make_synthetic, rewrite
 
 from xop_lerobot.core.page import dump_script
 from xop_lerobot.curate.cli import main
-from xop_lerobot.curate.figures import FIGURES
-from xop_lerobot.curate.report_episode import Limits
-from xop_lerobot.curate.report_page import Report
+from xop_lerobot.curate.measures import FIGURES
+from xop_lerobot.curate.report_page import Limits, Report
 from xop_lerobot.curate.source import Source
 from xop_lerobot.curate.survey import survey
-from xop_lerobot.curate.traces import decode, encode, thin
+from xop_lerobot.curate.timeline import decode, encode, thin
 from xop_lerobot.recording.facts import EPISODES_FILE
 
 EPISODES, FRAMES = 6, 100

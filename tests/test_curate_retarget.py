@@ -24,13 +24,14 @@ from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.curate.cli import main
 from xop_lerobot.curate.retarget import RetargetFolder
-from xop_lerobot.curate.retarget_config import (
+from xop_lerobot.curate.retarget_job import (
     RetargetConfig,
+    RetargetJob,
     choose_fps,
+    parse_episodes,
     read_settings,
     read_weights,
 )
-from xop_lerobot.curate.retarget_job import RetargetJob, parse_episodes
 from xop_lerobot.curate.retarget_worker import Retargeter
 from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.recording import Recording, load_recording, make_recording

@@ -31,7 +31,7 @@ from xop_lerobot.core.errors import BadValue, LinkError, XopError
 from xop_lerobot.core.shutdown import hold_signals
 from xop_lerobot.core.state import FRAMES, Goal
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.recording import durability, embedding
+from xop_lerobot.recording import writer
 from xop_lerobot.recording.columns import COST_NAMES, HEALTH_NAMES, Columns
 from xop_lerobot.recording.dataset import (
     BatchedEncoding,
@@ -42,7 +42,7 @@ from xop_lerobot.recording.dataset import (
 from xop_lerobot.recording.executed import put_executed
 from xop_lerobot.recording.facts import compute_config_hash, read_facts
 from xop_lerobot.recording.record import build_features
-from xop_lerobot.recording.video_queue import MAX_IMAGES, VideoQueue
+from xop_lerobot.recording.writer import MAX_IMAGES, VideoQueue
 from xop_lerobot.session import Executed, Outcome, TickRecord, get_session
 
 REPO = Path(__file__).parents[1]
@@ -238,7 +238,7 @@ def test_tables_are_what_lerobot_writes(session, pair, tmp_path, monkeypatch, us
     robot, teleop = pair
     features = build_features(robot, use_videos=use_videos)
     tables = []
-    for name, skip in (("ours", embedding.skip_embedding), ("stock", lambda _: nullcontext())):
+    for name, skip in (("ours", writer.skip_embedding), ("stock", lambda _: nullcontext())):
         monkeypatch.setattr("xop_lerobot.recording.dataset.skip_embedding", skip)
         bound = XopDataset.bind(session)
         dataset = bound.create(
@@ -505,7 +505,7 @@ def test_a_dead_encoder_is_not_waited_for():
 def test_pictures_that_wait_for_the_disk_are_bounded(monkeypatch, alive):
     """Who adds a frame waits until the image files have caught up; dead workers never do."""
     waiting = list(range(MAX_IMAGES + 2))
-    monkeypatch.setattr("xop_lerobot.recording.video_queue.time.sleep", lambda _: waiting.pop())
+    monkeypatch.setattr("xop_lerobot.recording.writer.time.sleep", lambda _: waiting.pop())
     queue = SimpleNamespace(qsize=lambda: len(waiting))
     worker = SimpleNamespace(is_alive=lambda: alive)
     images = SimpleNamespace(queue=queue, threads=[worker], processes=[])
@@ -583,7 +583,7 @@ def test_saved_episodes_load_while_the_session_goes_on(
     session, pair, tmp_path, monkeypatch, rotates
 ):
     """The files on disk are whole after each save, also when LeRobot's private names are gone."""
-    monkeypatch.setattr(durability, "can_rotate", lambda dataset: rotates)
+    monkeypatch.setattr(writer, "can_rotate", lambda dataset: rotates)
     robot, teleop = pair
     dataset = create(session, robot, tmp_path / "data", **STREAMING)
     for saved in range(1, 4):
@@ -600,7 +600,7 @@ def test_saved_episodes_load_while_the_session_goes_on(
 
 
 def test_can_rotate_this_lerobot(session, pair, tmp_path):
-    assert durability.can_rotate(create(session, pair[0], tmp_path / "data"))
+    assert writer.can_rotate(create(session, pair[0], tmp_path / "data"))
 
 
 def test_signals_wait_for_the_save():

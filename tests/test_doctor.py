@@ -21,16 +21,22 @@ from websockets.exceptions import ConnectionClosed
 from webxr_client import Page
 
 from xop_lerobot.core.transforms import make_pose, quat_exp
-from xop_lerobot.doctor import cli, cpu, disk, interpreter, plugin
-from xop_lerobot.doctor.certificate import check_certificate
-from xop_lerobot.doctor.child import Answer, run_child
-from xop_lerobot.doctor.disk import check_disk
-from xop_lerobot.doctor.finding import Finding, Level, Setup
-from xop_lerobot.doctor.gl import check_gl
-from xop_lerobot.doctor.headset import check_headset
-from xop_lerobot.doctor.interpreter import check_interpreter, find_faults
-from xop_lerobot.doctor.plugin import check_plugin
-from xop_lerobot.doctor.ports import check_ports
+from xop_lerobot.doctor import checks, cli
+from xop_lerobot.doctor.checks import (
+    Answer,
+    Finding,
+    Level,
+    Setup,
+    check_certificate,
+    check_disk,
+    check_gl,
+    check_headset,
+    check_interpreter,
+    check_plugin,
+    check_ports,
+    find_faults,
+    run_child,
+)
 from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.certificate import get_certificate
@@ -39,7 +45,7 @@ from xop_lerobot.operator.webxr.certificate import get_certificate
 def test_interpreter(monkeypatch):
     found = check_interpreter(Setup())
     assert found.level is Level.OK, found.text
-    monkeypatch.setattr(interpreter, "DISTRIBUTION", "nobody-has-this")
+    monkeypatch.setattr(checks, "DISTRIBUTION", "nobody-has-this")
     found = check_interpreter(Setup())
     assert found.level is Level.FAIL
     assert found.advice == "install it into this Python: pip install -e . in the project's folder"
@@ -47,7 +53,7 @@ def test_interpreter(monkeypatch):
         f"numpy is {np.__version__}, and <1 is needed",
         "not-there is not installed",
     ]
-    monkeypatch.setattr(interpreter, "DISTRIBUTION", "numpy")
+    monkeypatch.setattr(checks, "DISTRIBUTION", "numpy")
     monkeypatch.setattr("platform.python_version", lambda: "2.7.18")
     assert check_interpreter(Setup()).advice == "make a new environment with that Python"
 
@@ -79,7 +85,7 @@ def test_plugin(monkeypatch):
 
     def answer(ok: bool, value: object) -> Finding:
         text = value if isinstance(value, str) else f"noise\n{json.dumps(value)}"
-        monkeypatch.setattr(plugin, "run_child", lambda *_, **__: Answer(ok, text))
+        monkeypatch.setattr(checks, "run_child", lambda *_, **__: Answer(ok, text))
         return check_plugin(Setup())
 
     assert answer(True, known).level is Level.OK
@@ -99,12 +105,12 @@ def test_disk(tmp_path, monkeypatch):
     deep = tmp_path / "not" / "yet" / "there"
     for free, level in ((50, Level.OK), (5, Level.WARN), (0.2, Level.FAIL)):
         usage = type("Usage", (), {"free": free * 1e9})
-        monkeypatch.setattr(disk.shutil, "disk_usage", lambda _, usage=usage: usage)
+        monkeypatch.setattr(checks.shutil, "disk_usage", lambda _, usage=usage: usage)
         found = check_disk(Setup(root=deep))
         assert found.level is level
         assert found.text == f"{free:.1f} GB are free for {deep}"
         assert found.figures["folder"] == str(tmp_path)
-    monkeypatch.setattr(disk.os, "access", lambda *_: False)
+    monkeypatch.setattr(checks.os, "access", lambda *_: False)
     assert "cannot be written" in check_disk(Setup(root=deep)).text
 
 
@@ -295,8 +301,8 @@ def test_a_page_that_streams(capsys):
 def test_head_room_of_the_planner(monkeypatch, median, slow, level):
     figures = {"wanted_hz": 25.0, "step_ms_median": median, "step_ms_p99": slow}
     monkeypatch.setattr("xop_lerobot.evaluation.bench.run_bench", lambda config: figures)
-    monkeypatch.setattr(cpu.os, "getloadavg", lambda: (99.0, 0, 0))
-    found = cpu.check_cpu(Setup(robot="rby1", mode="mobile"))
+    monkeypatch.setattr(checks.os, "getloadavg", lambda: (99.0, 0, 0))
+    found = checks.check_cpu(Setup(robot="rby1", mode="mobile"))
     assert found.level is level
     assert found.text.startswith(f"a plan for rby1, mobile, takes {median:.1f} ms of the 40 ms")
     assert found.figures["period_ms"] == 40

@@ -17,8 +17,7 @@ from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.operator.display import Cue, Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.recording.facts import read_facts
-from xop_lerobot.recording.requests import grant
-from xop_lerobot.recording.tally import Tally
+from xop_lerobot.recording.requests import Tally, grant
 
 POSTURES = {
     "rest": (quat_from_rpy(0, 0, 0), 1.1),

@@ -11,7 +11,7 @@ from eval_jobs import do, make_trial, run_made
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.pool import THREAD_VARIABLES, run_jobs
 from xop_lerobot.evaluation import study
-from xop_lerobot.evaluation.eval_cli import main
+from xop_lerobot.evaluation.cli import main
 from xop_lerobot.evaluation.methods import (
     METHODS,
     make_retargeter_config,
@@ -23,12 +23,12 @@ from xop_lerobot.evaluation.study import (
     Results,
     collect,
     compute_key,
+    load_study,
     make_cell,
     plan_jobs,
     run_study,
     summarise,
 )
-from xop_lerobot.evaluation.study_file import load_study
 from xop_lerobot.evaluation.trial import TrialSetup
 from xop_lerobot.morphology.morphology import make_morphology
 

@@ -16,8 +16,8 @@ from headset_rig import POLICIES, RATE, Fault, Rig
 
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_yaw
-from xop_lerobot.operator.clutch import Clutch, Wish
 from xop_lerobot.operator.devices import DeviceConfig
+from xop_lerobot.operator.engagement import Clutch, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 
 

@@ -12,7 +12,7 @@ from lerobot_robot_xop import XopG1Config
 from lerobot_robot_xop.xop_robot import XopG1
 from xop_lerobot.collect.config import CollectConfig
 from xop_lerobot.core.errors import BadValue, UnknownName
-from xop_lerobot.evaluation.eval_cli import main
+from xop_lerobot.evaluation.cli import main
 from xop_lerobot.evaluation.study import compute_key
 from xop_lerobot.evaluation.trial import TrialSetup
 from xop_lerobot.morphology.morphology import make_morphology

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from xop_lerobot.core.errors import BadShape, BadValue
 from xop_lerobot.core.transforms import make_pose, quat_exp, quat_from_yaw, quat_multiply
-from xop_lerobot.evaluation.intervals import compute_mean_interval, compute_rate_interval
 from xop_lerobot.evaluation.metrics import (
     compute_balance_power,
     compute_jerk,
@@ -20,6 +19,7 @@ from xop_lerobot.evaluation.metrics import (
     compute_tracking_error,
     find_runs,
 )
+from xop_lerobot.evaluation.summary import compute_mean_interval, compute_rate_interval
 
 DT = 0.04
 

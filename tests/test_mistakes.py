@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from xop_lerobot.core.command_line import TRACEBACK_VARIABLE, find_mistake, report_mistakes
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.core.mistakes import TRACEBACK_VARIABLE, find_mistake, report_mistakes
 
 ROOT = Path(__file__).parents[1]
 

@@ -9,9 +9,13 @@ import pytest
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.state import FRAMES
-from xop_lerobot.core.transforms import quat_from_rpy, quat_rotate, rotation_error
+from xop_lerobot.core.transforms import (
+    compute_minimum_jerk,
+    quat_from_rpy,
+    quat_rotate,
+    rotation_error,
+)
 from xop_lerobot.operator.devices import DeviceConfig, make_device
-from xop_lerobot.operator.interpolation import compute_minimum_jerk
 from xop_lerobot.operator.noise import HEAD_SWAY, TREMOR, TREMOR_BAND, BandNoise, HumanNoise
 from xop_lerobot.operator.script import BadScript, Script, list_scripts, load_script, make_script
 
@@ -284,7 +288,7 @@ def test_importing_the_operator_is_light() -> None:
     code = (
         "import sys\n"
         "import xop_lerobot.operator.devices, xop_lerobot.operator.alignment\n"
-        "import xop_lerobot.operator.gestures, xop_lerobot.operator.goal_velocity\n"
+        "import xop_lerobot.operator.gestures, xop_lerobot.operator.goal\n"
         "heavy = {'mujoco', 'torch', 'lerobot', 'scipy', 'pyarrow', 'yaml', 'mink'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )

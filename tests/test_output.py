@@ -16,8 +16,8 @@ from curate_data import make_synthetic, rewrite
 
 from xop_lerobot.core.command_line import can_print_anything, make_output_readable
 from xop_lerobot.curate import cli as curate
+from xop_lerobot.curate.cli import VERBS
 from xop_lerobot.curate.task_words import TASKS_FILE
-from xop_lerobot.curate.verbs import VERBS
 
 WORDS = "Tür öffnen … 手"
 SPELT = r"Tur offnen ... \u624b"
@@ -142,14 +142,14 @@ def test_other_commands(monkeypatch):
     from xop_lerobot.collect import cli as collect
     from xop_lerobot.control import client
     from xop_lerobot.doctor import cli as doctor
-    from xop_lerobot.doctor.finding import Finding, Level
-    from xop_lerobot.evaluation import bench, eval_cli
+    from xop_lerobot.doctor.checks import Finding, Level
+    from xop_lerobot.evaluation import bench, cli
 
-    for command in (collect, bench, eval_cli, doctor, client):
+    for command in (collect, bench, cli, doctor, client):
         with pytest.raises(SystemExit) as end:
             command.main(["--help"])
         assert end.value.code == 0
-    assert eval_cli.main(["--größe", "…"]) == 2
+    assert cli.main(["--größe", "…"]) == 2
     assert doctor.main(["--größe", "…"]) == 2
     doctor.print_finding("disk", Finding(Level.FAIL, "5 °C …", "do this"))
     out, err = terminal.read()

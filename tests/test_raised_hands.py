@@ -19,12 +19,11 @@ from xop_lerobot.core.transforms import (
     quat_multiply,
     quat_rotate,
 )
-from xop_lerobot.operator.clutch import Clutch
-from xop_lerobot.operator.clutch import Wish as ClutchWish
 from xop_lerobot.operator.display import Wish
+from xop_lerobot.operator.engagement import Clutch
+from xop_lerobot.operator.engagement import Wish as ClutchWish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.gestures import GestureConfig
-from xop_lerobot.operator.hands import Hands, explain_gestures
+from xop_lerobot.operator.gestures import GestureConfig, Hands, explain_gestures
 from xop_lerobot.operator.raised_hands import RaisedHands, RaisedHandsConfig
 from xop_lerobot.operator.recording import load_recording
 

@@ -96,10 +96,9 @@ def check_control(flags: list[str]) -> None:
 
 def check_curate(words: list[str]) -> None:
     """Check that a verb takes the flags, and that expressions are ones."""
-    from xop_lerobot.curate.cli import make_verb_parser
+    from xop_lerobot.curate.cli import load_verb, make_verb_parser
     from xop_lerobot.curate.expression import Expression
-    from xop_lerobot.curate.figures import KINDS
-    from xop_lerobot.curate.verbs import load_verb
+    from xop_lerobot.curate.measures import KINDS
 
     parsed = make_verb_parser(words[0], load_verb(words[0])).parse(words[1:])
     if hasattr(parsed, "where"):
@@ -125,7 +124,7 @@ def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.Monk
         return
     if command[0] == "xop-eval":
         from xop_lerobot.evaluation import study
-        from xop_lerobot.evaluation.eval_cli import make_study, parse_arguments
+        from xop_lerobot.evaluation.cli import make_study, parse_arguments
 
         monkeypatch.chdir(ROOT)
         monkeypatch.setattr(study, "_find_absence", lambda *_: "")

@@ -78,7 +78,7 @@ POINTS = {
 def test_a_full_disk_costs_one_episode(
     session, pair, tmp_path, monkeypatch, point, rotates  # noqa: F811
 ):  # fmt: skip
-    monkeypatch.setattr("xop_lerobot.recording.durability.can_rotate", lambda _: rotates)
+    monkeypatch.setattr("xop_lerobot.recording.writer.can_rotate", lambda _: rotates)
     root = tmp_path / "data"
     dataset = create(session, pair[0], root, **STREAMING)
     for _ in range(2):

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from xop_lerobot.recording.schedule import keep_schedule
+from xop_lerobot.recording.writer import keep_schedule
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="only on Linux")
 

@@ -11,8 +11,8 @@ from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import make_pose, quat_log, quat_multiply, quat_yaw
 from xop_lerobot.core.transforms import quat_conjugate as conjugate
 from xop_lerobot.operator.devices import DeviceConfig, make_device
+from xop_lerobot.operator.display import SeenObject, View
 from xop_lerobot.operator.noise import HumanNoise
-from xop_lerobot.operator.view import SeenObject, View
 from xop_lerobot.tasks.person.body import Body, relaxed_hands
 from xop_lerobot.tasks.person.box_pick_and_place import bring_up
 from xop_lerobot.tasks.person.device import SimulatedDevice

@@ -20,8 +20,8 @@ from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 from xop_lerobot.core.transforms import quat_from_rpy
 from xop_lerobot.morphology.morphology import ArmChain, Morphology, make_morphology
 from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
-from xop_lerobot.plant.gl import RenderingUnavailable, choose_backends, make_gl_context
 from xop_lerobot.plant.plant import Plant
+from xop_lerobot.plant.rendering import RenderingUnavailable, choose_backends, make_gl_context
 from xop_lerobot.plant.simulation import Simulation
 
 if TYPE_CHECKING:

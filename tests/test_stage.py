@@ -16,7 +16,7 @@ from xop_lerobot.core.state import Goal
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.operator.view import View
+from xop_lerobot.operator.display import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.retarget.config import RetargeterConfig

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import (
+    compute_minimum_jerk,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -21,8 +22,7 @@ from xop_lerobot.core.transforms import (
     quat_multiply,
 )
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_minimum_jerk
-from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
+from xop_lerobot.operator.stream import GuardConfig, StreamGuard
 
 DT = 1 / 100
 

@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
-from xop_lerobot.evaluation import strip, summary
+from xop_lerobot.evaluation import film as films
+from xop_lerobot.evaluation import summary
 
 FPS = 25
 HEALTH_NAMES = ["plan_age", "solve_time"]
@@ -121,39 +122,39 @@ def make_film(count: int, colour: tuple[int, int, int], height: int = 48) -> np.
 
 
 def test_moments_run_from_the_first_to_the_last() -> None:
-    assert strip.choose_moments(100, 8).tolist() == [0, 14, 28, 42, 57, 71, 85, 99]
-    assert strip.choose_moments(3, 8).tolist() == [0, 1, 2]
+    assert films.choose_moments(100, 8).tolist() == [0, 14, 28, 42, 57, 71, 85, 99]
+    assert films.choose_moments(3, 8).tolist() == [0, 1, 2]
     with pytest.raises(BadValue, match="no frame"):
-        strip.choose_moments(0)
+        films.choose_moments(0)
 
 
 def test_a_strip_shows_every_camera_at_every_moment(tmp_path: Path) -> None:
     cameras = {"head": make_film(50, (250, 0, 0)), "scene": make_film(50, (0, 0, 250))}
     path = tmp_path / "new" / "strip.png"
-    picture = strip.write_strip(path, cameras, FPS, number=4)
-    row = 48 + strip.LABEL_HEIGHT
-    assert picture.shape == (2 * row + strip.GAP, 4 * 64 + 3 * strip.GAP, 3)
+    picture = films.write_strip(path, cameras, FPS, number=4)
+    row = 48 + films.LABEL_HEIGHT
+    assert picture.shape == (2 * row + films.GAP, 4 * 64 + 3 * films.GAP, 3)
     np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
-    for column, index in enumerate(strip.choose_moments(50, 4)):
-        x = column * (64 + strip.GAP) + 5
+    for column, index in enumerate(films.choose_moments(50, 4)):
+        x = column * (64 + films.GAP) + 5
         green = cameras["head"][index, 0, 0, 1]
         assert picture[row - 5, x].tolist() == [250, green, 0]
         assert picture[2 * row, x].tolist() == [0, green, 250]
-    assert (picture[: strip.LABEL_HEIGHT] < 128).any(), "no text over the first row"
+    assert (picture[: films.LABEL_HEIGHT] < 128).any(), "no text over the first row"
 
 
 def test_films_that_do_not_belong_together_are_refused() -> None:
     with pytest.raises(BadShape, match=r"camera 'scene' must have shape \(5, 'height'"):
-        strip.build_strip({"head": make_film(5, (0, 0, 0)), "scene": make_film(4, (0, 0, 0))}, FPS)
+        films.build_strip({"head": make_film(5, (0, 0, 0)), "scene": make_film(4, (0, 0, 0))}, FPS)
     with pytest.raises(BadValue, match="there is no camera to show"):
-        strip.build_strip({}, FPS)
+        films.build_strip({}, FPS)
 
 
 def make_dataset(root: Path, lengths: list[int]) -> Any:
     """Make what `read_camera` and `read_columns` take of a dataset: one film, many episodes."""
     key = "observation.images.head"
     film = root / "film.mp4"
-    strip.write_video(film, make_film(sum(lengths), (0, 0, 0)), FPS)
+    films.write_video(film, make_film(sum(lengths), (0, 0, 0)), FPS)
     begins = np.cumsum([0, *lengths]) / FPS
     episodes = [
         {"length": length, f"videos/{key}/from_timestamp": begin}
@@ -173,7 +174,7 @@ def test_a_film_is_read_back_by_episode(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path, [10, 15])
     levels = make_film(25, (0, 0, 0))[:, 0, 0, 1].astype(int)
     for episode, expected in ((0, levels[:10]), (1, levels[10:])):
-        frames = strip.read_camera(dataset, "head", episode)
+        frames = films.read_camera(dataset, "head", episode)
         assert frames.shape == (len(expected), 48, 64, 3) and frames.dtype == np.uint8
         assert np.abs(frames[:, 24, 32, 1].astype(int) - expected).max() < 12  # lossy colour
         assert (np.diff(frames[:, 24, 32, 1].astype(int)) > 0).all(), "frames out of order"
@@ -182,28 +183,28 @@ def test_a_film_is_read_back_by_episode(tmp_path: Path) -> None:
 def test_an_unknown_camera_and_a_short_film_are_errors(tmp_path: Path) -> None:
     dataset = make_dataset(tmp_path, [10])
     with pytest.raises(UnknownName, match="unknown camera 'rear'. Known: head"):
-        strip.read_camera(dataset, "rear")
+        films.read_camera(dataset, "rear")
     dataset.meta.episodes[0]["length"] = 12
     with pytest.raises(BadValue, match="camera 'head' has 10 of the 12 frames"):
-        strip.read_camera(dataset, "head")
+        films.read_camera(dataset, "head")
 
 
 def test_an_odd_sized_film_is_written_whole(tmp_path: Path) -> None:
     cameras = {"head": make_film(30, (9, 0, 9), height=47), "scene": make_film(30, (0, 0, 0))}
     path = tmp_path / "film.mp4"
-    assert strip.write_video(path, strip.build_film(cameras, FPS), FPS) == 30
+    assert films.write_video(path, films.build_film(cameras, FPS), FPS) == 30
     with av.open(str(path)) as film:
         stream = film.streams.video[0]
         assert stream.codec_context.name == "h264"
         assert stream.average_rate == FPS
         assert len(list(film.decode(video=0))) == 30
     gif = tmp_path / "film.gif"
-    assert strip.write_gif(gif, strip.build_film(cameras, FPS), FPS, every=5) == 6
+    assert films.write_gif(gif, films.build_film(cameras, FPS), FPS, every=5) == 6
     with Image.open(gif) as moving:
         assert getattr(moving, "n_frames", 1) == 6
         assert moving.info["duration"] == 200
     with pytest.raises(BadValue, match="there is no frame to write"):
-        strip.write_video(tmp_path / "none.mp4", [], FPS)
+        films.write_video(tmp_path / "none.mp4", [], FPS)
 
 
 def test_columns_of_a_real_dataset_are_read_by_episode(

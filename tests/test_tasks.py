@@ -12,7 +12,7 @@ from xop_lerobot.core.transforms import make_pose, quat_from_rpy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.tasks import box_pick_and_place as box_task
 from xop_lerobot.tasks import dual_point_touch as touch
-from xop_lerobot.tasks.hold import Hold
+from xop_lerobot.tasks.furniture import Touching, compute_tilt
 from xop_lerobot.tasks.layout import (
     DRAW_IN,
     find_room,
@@ -21,7 +21,7 @@ from xop_lerobot.tasks.layout import (
     measure_reach,
 )
 from xop_lerobot.tasks.stage import Stage
-from xop_lerobot.tasks.touching import Touching, compute_tilt
+from xop_lerobot.tasks.task import Hold
 
 ROBOTS = ("g1", "rby1")
 

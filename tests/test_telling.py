@@ -15,8 +15,8 @@ from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.operator.devices.live import LiveDevice
 from xop_lerobot.operator.display import Cue, NoticeBoard
+from xop_lerobot.operator.feedback import describe_settings, list_warnings, tell_changes
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.telling import describe_settings, list_warnings, tell_changes
 from xop_lerobot.retarget.changes import Change
 from xop_lerobot.retarget.online import AppliedChange
 

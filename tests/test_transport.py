@@ -12,8 +12,8 @@ from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.tasks import non_prehensile_transport as transport
+from xop_lerobot.tasks.furniture import Touching, compute_tilt
 from xop_lerobot.tasks.stage import Stage
-from xop_lerobot.tasks.touching import Touching, compute_tilt
 
 TASK = "non_prehensile_transport"
 ROBOTS = ("g1", "rby1")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from xop_lerobot.core.errors import BadValue, UnknownName
-from xop_lerobot.evaluation.report_films import load_film, render_film
+from xop_lerobot.evaluation.report import load_film, render_film
 from xop_lerobot.evaluation.study import Job, Results, run_job
 from xop_lerobot.evaluation.trial import Trace, TrialSetup, run_trial
 from xop_lerobot.evaluation.trial_metrics import (
@@ -17,7 +17,7 @@ from xop_lerobot.evaluation.trial_metrics import (
     make_record,
 )
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.plant.gl import RenderingUnavailable
+from xop_lerobot.plant.rendering import RenderingUnavailable
 
 DIRECT = TrialSetup("g1", "dual_point_touch", "direct", time_limit=3.0)
 

@@ -24,7 +24,7 @@ from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.devices.webxr import PortTaken, WebXrDevice
 from xop_lerobot.operator.display import Cue, Display, Notice, Progress, Wish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.webxr.clock_offset import ClockOffset
+from xop_lerobot.operator.webxr.client import ClockOffset
 from xop_lerobot.operator.webxr.delay_meter import MAX_FRAMES, DelayMeter
 from xop_lerobot.operator.webxr.protocol import Bye, FrameMessage, Pong, parse_message
 

@@ -29,7 +29,8 @@ from webxr_client import CODE, Page, encode
 
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.devices.webxr import WebXrDevice
-from xop_lerobot.operator.webxr import addresses, connections, pairing, server
+from xop_lerobot.operator.webxr import addresses, pairing, server
+from xop_lerobot.operator.webxr.addresses import draw_qr, write_invitation
 from xop_lerobot.operator.webxr.certificate import (
     RENEW,
     VALID,
@@ -37,7 +38,6 @@ from xop_lerobot.operator.webxr.certificate import (
     get_certificate,
     list_own_names,
 )
-from xop_lerobot.operator.webxr.invitation import draw_qr, write_invitation
 from xop_lerobot.operator.webxr.pairing import ALPHABET, Door, RateLimit, make_code
 
 NOW = datetime.datetime(2026, 5, 1, tzinfo=datetime.UTC)
@@ -214,12 +214,12 @@ def test_pages(device):
 
 
 def test_connections_that_ask_nothing_are_ended(device, monkeypatch):
-    monkeypatch.setattr(connections, "FIRST_REQUEST_S", 0.05)
+    monkeypatch.setattr(pairing, "FIRST_REQUEST_S", 0.05)
     with socket.create_connection(("localhost", device.port), timeout=120) as idle:
         idle.sendall(b"GET / HT")
         with pytest.raises((ConnectionResetError, AssertionError)):
             assert idle.recv(100) != b""
-    monkeypatch.setattr(connections, "FIRST_REQUEST_S", 60.0)
+    monkeypatch.setattr(pairing, "FIRST_REQUEST_S", 60.0)
     crowd = [socket.create_connection(("localhost", device.port)) for _ in range(200)]
     crowd[-1].settimeout(120)
     assert crowd[-1].recv(100) == b""  # there was no room for it
@@ -382,7 +382,7 @@ def test_invitation(monkeypatch):
         "For headsets in the network, let it listen there: --teleop.device.host=0.0.0.0\n"
     )
     monkeypatch.setattr(
-        "xop_lerobot.operator.webxr.invitation.list_addresses",
+        "xop_lerobot.operator.webxr.addresses.list_addresses",
         lambda: ["192.168.1.5", "fd00::2", "10.0.0.9"],
     )
     text = write_invitation("0.0.0.0", 8012, True, CODE, "AA:BB")

@@ -18,14 +18,13 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 from benchmarks.tracking_setup import parse_overrides
 from lerobot_robot_xop import XopG1Config
 from lerobot_teleoperator_xop import XopConfig
-from xop_lerobot.collect.flags import add_config
+from xop_lerobot.collect.config import add_config
 from xop_lerobot.control.protocol import find_socket
-from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser, find_mistake
 from xop_lerobot.core.errors import BadValue, UnknownName
-from xop_lerobot.core.mistakes import find_mistake
 from xop_lerobot.core.yaml_words import fill_nulls, find_word, load_yaml
-from xop_lerobot.curate.retarget_config import read_settings, read_weights
-from xop_lerobot.evaluation.study_file import load_study
+from xop_lerobot.curate.retarget_job import read_settings, read_weights
+from xop_lerobot.evaluation.study import load_study
 from xop_lerobot.plant.config import NOISE_PRESETS
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.obstacles import load_obstacles

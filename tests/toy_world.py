@@ -7,13 +7,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.transforms import make_pose, pose_inverse, pose_multiply, quat_from_yaw
+from xop_lerobot.core.transforms import (
+    compute_heading,
+    interpolate_poses,
+    make_pose,
+    pose_inverse,
+    pose_multiply,
+    quat_from_yaw,
+)
 from xop_lerobot.operator.alignment import Alignment
 from xop_lerobot.operator.device import Device
+from xop_lerobot.operator.display import SeenObject, View
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import Gesture, GestureReader
-from xop_lerobot.operator.interpolation import compute_heading, interpolate_poses
-from xop_lerobot.operator.view import SeenObject, View
 
 DT = 0.04
 PALM = np.array([0.1, 0, 0, 1, 0, 0, 0])

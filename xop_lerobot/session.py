@@ -17,9 +17,8 @@ import numpy as np
 
 from xop_lerobot.core.errors import LinkError
 from xop_lerobot.core.state import Goal, RobotState
-from xop_lerobot.operator.display import Cue, Progress, Wish
+from xop_lerobot.operator.display import Cue, Progress, View, Wish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.view import View
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology

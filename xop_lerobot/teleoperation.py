@@ -17,19 +17,15 @@ from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.reach import compute_forward_reach
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
-from xop_lerobot.operator.clutch import Clutch
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DeviceConfig, make_device
-from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, Wish
-from xop_lerobot.operator.engagement import Engagement
+from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, View, Wish
+from xop_lerobot.operator.engagement import Clutch, Engagement
+from xop_lerobot.operator.feedback import list_warnings, tell_changes
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.gestures import GestureConfig, grip_from_pinch
-from xop_lerobot.operator.goal_velocity import GoalVelocity
-from xop_lerobot.operator.hand_blend import HandBlend
-from xop_lerobot.operator.hands import Hands, explain_gestures
+from xop_lerobot.operator.gestures import GestureConfig, Hands, explain_gestures, grip_from_pinch
+from xop_lerobot.operator.goal import GoalVelocity, HandBlend
 from xop_lerobot.operator.raised_hands import HOLDING
-from xop_lerobot.operator.telling import list_warnings, tell_changes
-from xop_lerobot.operator.view import View
 from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.plant.watch import MOVES
 from xop_lerobot.retarget.arms.driver import ArmDriver

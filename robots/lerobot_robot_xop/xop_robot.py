@@ -10,14 +10,14 @@ import numpy as np
 from lerobot.robots.robot import Robot
 
 from lerobot_robot_xop.config_xop import XopG1Config, XopRby1Config, XopRobotConfig
+from xop_lerobot.core.command_line import report_mistakes
 from xop_lerobot.core.errors import NotConnected, UnknownName
-from xop_lerobot.core.mistakes import report_mistakes
 from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.body import Body
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_scene_spec
 from xop_lerobot.session import Executed, RobotInfo, get_session
-from xop_lerobot.tasks.camera import add_task_camera
+from xop_lerobot.tasks.layout import add_task_camera
 from xop_lerobot.tasks.task import make_task
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from lerobot.utils.keyboard_input import (
     pynput_can_capture,
 )
 
-from xop_lerobot.control.keys import HELP, Target, press
+from xop_lerobot.control.client import HELP, Target, press
 from xop_lerobot.recording.host import RECORD_MODULE, ROLLOUT_MODULE, find
 
 logger = logging.getLogger(__name__)

@@ -14,8 +14,8 @@ from lerobot.teleoperators.teleoperator import Teleoperator
 
 from lerobot_teleoperator_xop.config_xop import XopConfig
 from xop_lerobot.control.protocol import find_socket
+from xop_lerobot.core.command_line import report_mistakes
 from xop_lerobot.core.errors import LinkError, NotConnected, XopError
-from xop_lerobot.core.mistakes import report_mistakes
 from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.calibration import (
     Calibration,

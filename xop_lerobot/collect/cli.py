@@ -18,11 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xop_lerobot.collect.config import CollectConfig
-from xop_lerobot.collect.flags import add_config, add_crew, read_config
+from xop_lerobot.collect.config import CollectConfig, add_config, add_crew, read_config
 from xop_lerobot.collect.folder import CollectFolder
-from xop_lerobot.collect.jobs import WorkerFailed
-from xop_lerobot.collect.run import run_collection
+from xop_lerobot.collect.run import WorkerFailed, run_collection
 from xop_lerobot.core.command_line import CommandParser, make_output_readable
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm

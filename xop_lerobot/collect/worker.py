@@ -20,7 +20,7 @@ from lerobot.utils.import_utils import make_device_from_device_class
 
 from xop_lerobot.collect.config import CollectConfig, import_plugins
 from xop_lerobot.collect.folder import DATASET, Attempt
-from xop_lerobot.collect.jobs import get_index
+from xop_lerobot.collect.run import get_index
 from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.lockstep import count_ticks
 from xop_lerobot.recording.record import build_features

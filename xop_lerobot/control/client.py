@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import socket
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 from xop_lerobot.control.protocol import MAX_LINE, find_socket, read_object, write_object
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import BadValue, XopError
+from xop_lerobot.core.paced_log import PacedLog
 
 _SWITCH = {"on": True, "true": True, "yes": True, "off": False, "false": False, "no": False}
 
@@ -174,3 +176,41 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 if __name__ == "__main__":
     main()
+
+
+_log = PacedLog(logging.getLogger(__name__))  # a key that is held down repeats
+
+PRESET_KEYS = {"d": "default", "c": "conservative", "a": "aggressive", "t": "table1"}
+TOGGLE_KEYS = {"m": "mode", "u": "upright"}
+HELP = "d/c/a/t: preset default, conservative, aggressive, table1; u: upright; m: mode"
+"""What the keys do. LeRobot's own are n, r, q, the arrows and Esc."""
+
+
+class Target(Protocol):
+    """What the keys change: a `Teleoperation`."""
+
+    def change(self, change: dict[str, Any], source: str = "call") -> dict[str, Any]:
+        """Ask for other settings."""
+        ...
+
+    def toggle(self, name: str, source: str = "call") -> dict[str, Any]:
+        """Toggle one."""
+        ...
+
+
+def press(key: str, target: Target) -> bool:
+    """Do what `key` stands for; return whether it stands for anything. Refusals are logged."""
+    key = key.lower()
+    try:
+        if key in PRESET_KEYS:
+            settings = target.change({"preset": PRESET_KEYS[key]}, "key")
+        elif key in TOGGLE_KEYS:
+            settings = target.toggle(TOGGLE_KEYS[key], "key")
+        else:
+            return False
+    except XopError as refusal:
+        _log.warning("Key %r changes nothing: %s", key, refusal)
+        return True
+    constraints = ", ".join(settings["constraints"]) or "none"
+    _log.info("Key %r: preset %s, constraints %s.", key, settings["preset"], constraints)
+    return True

@@ -1,16 +1,24 @@
-"""What the commands of this project share: a parser with the project's errors, readable output."""
+"""What the commands of this project share: a parser with the project's errors, readable output.
+
+A user's mistake ends LeRobot's commands in one line that names it. LeRobot lets every error end in
+a traceback and wraps those of a device's constructor in its whole configuration, so that what is
+wrong stands at the end of some forty lines. `XOP_TRACEBACK=1` brings the traceback back.
+"""
 
 from __future__ import annotations
 
 import argparse
 import codecs
 import io
+import os
 import sys
 import unicodedata
 from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
 from typing import Any, NoReturn
 
-from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 
 _SPELL_OUT = "xop-spell-out"
 _SPELLINGS = {
@@ -93,3 +101,48 @@ class CommandParser(argparse.ArgumentParser):
         if unknown:
             refuse(unknown[0])
         return parsed
+
+
+TRACEBACK_VARIABLE = "XOP_TRACEBACK"
+_COMMANDS = ("lerobot-", "lerobot_")
+
+
+def find_mistake(error: BaseException | None) -> XopError | None:
+    """Return the outermost error of this project among `error` and its explicit causes."""
+    while error is not None and not isinstance(error, XopError):
+        error = error.__cause__
+    return error
+
+
+def report_mistakes() -> None:
+    """Let this project's errors end the process in one line, if one of LeRobot's commands runs.
+
+    Programs of others keep their tracebacks, and so do all other errors.
+    """
+    program = Path(sys.argv[0]).name if sys.argv else ""
+    stock = sys.excepthook
+    if not program.startswith(_COMMANDS) or getattr(stock, "xop_stock", None):
+        return
+    make_output_readable()
+
+    def report(
+        kind: type[BaseException], error: BaseException, trace: TracebackType | None
+    ) -> None:
+        mistake = find_mistake(error)
+        if mistake is None or os.environ.get(TRACEBACK_VARIABLE):
+            stock(kind, error, trace)
+        else:
+            print(f"error: {mistake}", file=sys.stderr)
+
+    report.xop_stock = stock  # pyright: ignore[reportFunctionMemberAccess]
+    sys.excepthook = report
+
+
+def say_count(count: int, noun: str) -> str:
+    """Return a number of things in words: 1 episode, 2 episodes.
+
+    Args:
+        count: How many.
+        noun: What, in the singular; a regular one.
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

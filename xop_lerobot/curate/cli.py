@@ -8,14 +8,61 @@ beside its place and gets there as a whole in the end, so a crash leaves everyth
 
 from __future__ import annotations
 
+import argparse
+import importlib
 import os
 import sys
 from collections.abc import Sequence
+from typing import Protocol, cast
 
 from xop_lerobot.core.command_line import CommandParser, make_output_readable
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm
-from xop_lerobot.curate.verbs import VERBS, Verb, load_verb
+
+_PACKAGE = "xop_lerobot.curate"
+VERBS = {
+    "inspect": "inspect",
+    "filter": "filter",
+    "trim": "trim",
+    "merge": "merge",
+    "split": "split",
+    "repair": "repair",
+    "label": "label",
+    "retarget": "retarget",
+    "report": "report",
+}
+"""Module of each verb, in the order of the list."""
+
+
+class Verb(Protocol):
+    """What a verb's module has; its docstring heads its own `--help`.
+
+    Modules are imported for `--help`, so whatever takes long to import (LeRobot, MuJoCo) is
+    imported in `run`.
+    """
+
+    SUMMARY: str
+    """One line of the list of verbs."""
+
+    def add_arguments(self, parser: CommandParser) -> None:
+        """Add the verb's flags."""
+        ...
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Do what the flags ask for; returns the exit code."""
+        ...
+
+
+def load_verb(name: str) -> Verb:
+    """Import a verb.
+
+    Raises:
+        UnknownName: Listing the known ones.
+    """
+    if name not in VERBS:
+        raise UnknownName("verb of xop-curate", name, VERBS)
+    return cast("Verb", importlib.import_module(f"{_PACKAGE}.{VERBS[name]}"))
+
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C or SIGTERM, as shells have it."""

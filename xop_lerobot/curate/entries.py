@@ -12,8 +12,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from xop_lerobot.core.command_line import say_count
 from xop_lerobot.core.errors import BadDataset
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.recording.facts import EPISODES_FILE, FACTS_PREFIX
 
 UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError)

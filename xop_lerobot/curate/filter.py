@@ -29,7 +29,7 @@ from xop_lerobot.curate.arguments import (
     show_progress,
 )
 from xop_lerobot.curate.expression import Expression
-from xop_lerobot.curate.figures import KINDS, describe_figures
+from xop_lerobot.curate.measures import KINDS, describe_figures
 from xop_lerobot.curate.source import EpisodeEntry, Source
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 
 from xop_lerobot.core.errors import BadDataset, BadValue
-from xop_lerobot.curate.label_session import HELP, LabelSession
+from xop_lerobot.curate.labels import HELP, LabelSession
 from xop_lerobot.curate.video import Cut, decode
-from xop_lerobot.evaluation.strip import build_film, choose_moments, write_strip
+from xop_lerobot.evaluation.film import build_film, choose_moments, write_strip
 
 if TYPE_CHECKING:
     from xop_lerobot.curate.source import EpisodeEntry, Source

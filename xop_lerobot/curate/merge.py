@@ -15,9 +15,8 @@ from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser, say_count
 from xop_lerobot.core.errors import BadDataset, BadValue
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.curate.arguments import (
     add_destination,
     add_sources,

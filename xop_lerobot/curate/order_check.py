@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from xop_lerobot.core.command_line import say_count
 from xop_lerobot.core.errors import BadDataset
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.curate.entries import UNREADABLE, EpisodeEntry
 from xop_lerobot.curate.source import Source
 from xop_lerobot.curate.task_words import (

@@ -19,8 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from xop_lerobot.core.command_line import CommandParser
-from xop_lerobot.core.wording import say_count
+from xop_lerobot.core.command_line import CommandParser, say_count
 from xop_lerobot.curate.arguments import (
     add_destination,
     add_source,

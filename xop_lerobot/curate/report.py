@@ -19,9 +19,8 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser, say_count
 from xop_lerobot.core.errors import BadDataset, BadValue
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.curate.arguments import add_source, show_progress
 from xop_lerobot.curate.source import Source
 
@@ -62,8 +61,7 @@ def add_arguments(parser: CommandParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write the report of a dataset; returns the exit code."""
     from xop_lerobot.curate.order_check import check_whole  # noqa: PLC0415
-    from xop_lerobot.curate.report_episode import Limits  # noqa: PLC0415 SciPy, MuJoCo
-    from xop_lerobot.curate.report_page import Report  # noqa: PLC0415
+    from xop_lerobot.curate.report_page import Limits, Report  # noqa: PLC0415
     from xop_lerobot.curate.survey import survey  # noqa: PLC0415
     from xop_lerobot.curate.timeline import list_missing  # noqa: PLC0415
 

@@ -22,22 +22,23 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.collect.flags import add_config, add_crew, read_config
+from xop_lerobot.collect.config import add_config, add_crew, read_config
 from xop_lerobot.collect.folder import CollectFolder, FolderTaken, write_whole
 from xop_lerobot.collect.run import Collection, run_collection
-from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser, say_count
 from xop_lerobot.core.errors import BadDataset, BadValue, XopError
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.curate.arguments import add_source
 from xop_lerobot.curate.clip import PROVENANCE, Step, name_source
-from xop_lerobot.curate.retarget_config import (
+from xop_lerobot.curate.retarget_job import (
     DEFAULT_FPS,
+    Operators,
     RetargetConfig,
+    RetargetJob,
     choose_fps,
+    parse_episodes,
     read_settings,
     read_weights,
 )
-from xop_lerobot.curate.retarget_job import Operators, RetargetJob, parse_episodes
 from xop_lerobot.curate.source import EpisodeEntry, Source
 from xop_lerobot.recording.facts import FACTS_DIR
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from xop_lerobot.collect.folder import Attempt
 from xop_lerobot.collect.worker import Collector
-from xop_lerobot.curate.retarget_config import DEVICE
+from xop_lerobot.curate.retarget_job import DEVICE
 from xop_lerobot.operator.alignment import EngageRefused
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.replay import ReplayDevice
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lerobot_teleoperator_xop.xop import Xop
-    from xop_lerobot.curate.retarget_config import RetargetConfig
-    from xop_lerobot.curate.retarget_job import RetargetJob
+    from xop_lerobot.curate.retarget_job import RetargetConfig, RetargetJob
     from xop_lerobot.operator.recording import Recording
     from xop_lerobot.recording.dataset import XopDataset
 

@@ -17,9 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xop_lerobot.core.command_line import CommandParser
+from xop_lerobot.core.command_line import CommandParser, say_count
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.curate.arguments import (
     add_destination,
     add_source,

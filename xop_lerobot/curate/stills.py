@@ -12,7 +12,7 @@ from PIL import Image
 from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.curate.source import EpisodeEntry, Source
 from xop_lerobot.curate.video import Cut, decode
-from xop_lerobot.evaluation.strip import choose_moments
+from xop_lerobot.evaluation.film import choose_moments
 
 _QUALITY = 72
 

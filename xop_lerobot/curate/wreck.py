@@ -23,8 +23,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import write_tasks
 
+from xop_lerobot.core.command_line import say_count
 from xop_lerobot.core.errors import BadDataset
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.curate.entries import (
     EPISODES_DIR,
     EpisodeEntry,

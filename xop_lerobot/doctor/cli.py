@@ -19,15 +19,19 @@ from pathlib import Path
 
 from xop_lerobot.core.command_line import CommandParser, make_output_readable
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
-from xop_lerobot.doctor.certificate import check_certificate
-from xop_lerobot.doctor.cpu import check_cpu
-from xop_lerobot.doctor.disk import check_disk
-from xop_lerobot.doctor.finding import Finding, Level, Setup
-from xop_lerobot.doctor.gl import check_gl
-from xop_lerobot.doctor.headset import check_headset
-from xop_lerobot.doctor.interpreter import check_interpreter
-from xop_lerobot.doctor.plugin import check_plugin
-from xop_lerobot.doctor.ports import check_ports
+from xop_lerobot.doctor.checks import (
+    Finding,
+    Level,
+    Setup,
+    check_certificate,
+    check_cpu,
+    check_disk,
+    check_gl,
+    check_headset,
+    check_interpreter,
+    check_plugin,
+    check_ports,
+)
 
 CHECKS: dict[str, Callable[[Setup], Finding]] = {
     "interpreter": check_interpreter,

@@ -32,6 +32,7 @@ from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.core.transforms import (
+    compute_heading,
     make_pose,
     quat_from_rpy,
     quat_from_yaw,
@@ -42,8 +43,7 @@ from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summaris
 from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.operator.goal_velocity import GoalVelocity
-from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.operator.goal import GoalVelocity
 from xop_lerobot.plant.config import NOISE_PRESETS, SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation

@@ -19,7 +19,7 @@ from xop_lerobot.evaluation.methods import make_retargeter_config, resolve_low_l
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.operator.devices import DeviceConfig
-from xop_lerobot.operator.view import View
+from xop_lerobot.operator.display import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.session import RobotInfo, TickRecord

@@ -11,6 +11,7 @@ import numpy as np
 from xop_lerobot.core.errors import BadShape, BadValue, UnknownName, XopError
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import (
+    compute_heading,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -21,7 +22,6 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.core.yaml_words import fill_nulls
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_heading
 
 MIN_OPERATOR_HEIGHT = 0.5
 """Head height of a person under which the device's origin is surely not the floor [m]."""

@@ -6,9 +6,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.operator.display import Display, Wish
+from xop_lerobot.operator.display import Display, View, Wish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.view import View
 
 
 class Device(ABC):

@@ -3,16 +3,166 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
+from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.state import RobotState
+from xop_lerobot.core.transforms import quat_rotate
+from xop_lerobot.core.yaml_words import fill_nulls
 from xop_lerobot.operator.alignment import Alignment, EngageRefused, is_lost
-from xop_lerobot.operator.clutch import Clutch, Wish
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.display import Cue, NoticeBoard
 from xop_lerobot.operator.frame import OperatorFrame
+
+GESTURES = ("palms_up", "both_pinch")
+"""`palms_up`: both hands pinch with their palms up. `both_pinch`: both pinch, however they lie."""
+WRISTS = ("left_wrist", "right_wrist")
+PALM_UP = -0.5
+"""The back of a hand that shows its palm points at least 30 degrees below the horizon."""
+
+
+@dataclass
+class ClutchConfig:
+    """How a person engages and lets go.
+
+    Attributes:
+        gesture: What is held, one of `GESTURES`. Grippers close with pinches, so with
+            ``"both_pinch"`` who carries something with both hands lets go of the robot.
+        hold: For how long [s].
+        on: A hand closes at this distance of thumb and index tip [m].
+        off: It opens again at this distance [m].
+        max_speed: Hands that are faster hold nothing [m/s].
+        max_gap: Longest time between two frames over which the gesture goes on [s].
+    """
+
+    gesture: str = "palms_up"
+    hold: float = 1.0
+    on: float = 0.018
+    off: float = 0.035
+    max_speed: float = 0.25
+    max_gap: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Check every value.
+
+        Raises:
+            UnknownName: If there is no such gesture, with the known ones.
+            BadValue: If a number is not above 0, or `on` is not below `off`.
+        """
+        fill_nulls(self)
+        if self.gesture not in GESTURES:
+            raise UnknownName("clutch.gesture", self.gesture, GESTURES)
+        for name in ("hold", "on", "off", "max_speed", "max_gap"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise BadValue(f"clutch.{name} must be finite and above 0, got {value}")
+        if self.on >= self.off:
+            raise BadValue(f"clutch.on must be below off, got {self.on} and {self.off}")
+
+
+class Wish(Enum):
+    """What the clutch asks for."""
+
+    NOTHING = "nothing"
+    ENGAGE = "engage"
+    LET_GO = "let go"
+
+
+class Clutch:
+    """Tells from the frames alone when to engage and when to let go.
+
+    The gesture counts when it was held for `hold` seconds, with both hands seen and still. It
+    then asks until it is granted, which `update` is told by `engaged`, and no more until the
+    hands have opened: one long hold does one thing. A lost head, or a stream that does not go
+    on, lets go at once. Only stamps count, so that a recorded stream replays to the same
+    engagements.
+
+    Args:
+        config: The gesture and its durations.
+    """
+
+    def __init__(self, config: ClutchConfig | None = None) -> None:
+        self.config = config or ClutchConfig()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything seen so far."""
+        self._time: float | None = None
+        self._wrists: np.ndarray | None = None
+        self._since: float | None = None
+        self._spent = True  # hands that are closed from the beginning must open first
+        self._engaged: bool | None = None
+        self.progress = 0.0
+        """How much of `hold` has passed, from 0 to 1."""
+
+    def update(self, frame: OperatorFrame | None, engaged: bool) -> Wish:
+        """Take one sample.
+
+        Frames with the stamp of the last one change nothing; a stamp that goes back starts anew.
+
+        Args:
+            frame: The operator now, None before the first.
+            engaged: Whether the operator drives the robot now.
+        """
+        if engaged is not self._engaged:
+            self._spent, self._engaged = True, engaged
+        if frame is None or not frame.tracked[0]:
+            self._stop()
+            return Wish.LET_GO if engaged else Wish.NOTHING
+        if self._time is not None and frame.time < self._time:
+            self.reset()
+            self._engaged = engaged
+        if frame.time != self._time:
+            self._follow(frame)
+        if self._spent or self.progress < 1:
+            return Wish.NOTHING
+        return Wish.LET_GO if engaged else Wish.ENGAGE
+
+    def _stop(self) -> None:
+        self._time = self._wrists = self._since = None
+        self._spent, self.progress = True, 0.0
+
+    def _follow(self, frame: OperatorFrame) -> None:
+        wrists = np.stack([frame.pose(name)[:3] for name in WRISTS])
+        still = self._is_still(frame.time, wrists)
+        self._time, self._wrists = frame.time, wrists
+        if not self._is_shown(frame) or not still:
+            self._since, self.progress = None, 0.0
+            # Hands that are lost have not been seen to open.
+            self._spent &= not (
+                frame.tracked.all() and bool((frame.pinch >= self.config.off).any())
+            )
+            return
+        if self._since is None:
+            self._since = frame.time
+        self.progress = 0.0 if self._spent else self._compute_progress(frame.time - self._since)
+
+    def _compute_progress(self, held: float) -> float:
+        # Stamps add up rounding; a microsecond must not cost a sample.
+        return min((held + 1e-6) / self.config.hold, 1.0)
+
+    def _is_still(self, time: float, wrists: np.ndarray) -> bool:
+        if self._time is None or self._wrists is None:
+            return False
+        dt = time - self._time
+        speed = np.linalg.norm(wrists - self._wrists, axis=1).max() / dt
+        return dt <= self.config.max_gap and bool(speed <= self.config.max_speed)
+
+    def _is_shown(self, frame: OperatorFrame) -> bool:
+        """Whether both hands make the gesture; once begun, until they open."""
+        near = self.config.on if self._since is None else self.config.off
+        if not frame.tracked.all() or not bool((frame.pinch < near).all()):
+            return False
+        if self.config.gesture == "both_pinch":
+            return True
+        up = np.array([0.0, 0, 1])
+        return all(quat_rotate(frame.pose(name)[3:], up)[2] <= PALM_UP for name in WRISTS)
+
 
 logger = logging.getLogger(__name__)
 

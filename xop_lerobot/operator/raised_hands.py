@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from xop_lerobot.core.errors import BadValue, UnknownName
-from xop_lerobot.core.transforms import quat_from_yaw, quat_rotate
+from xop_lerobot.core.transforms import compute_heading, quat_from_yaw, quat_rotate
 from xop_lerobot.core.yaml_words import fill_nulls, find_word
 from xop_lerobot.operator.display import Wish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_heading
 
 RAISED = ("left", "right", "both", "none")
 WRISTS = ("left_wrist", "right_wrist")

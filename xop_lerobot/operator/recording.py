@@ -13,8 +13,8 @@ from numpy.lib.format import MAGIC_PREFIX
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadRecording
 from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.transforms import interpolate_poses
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import interpolate_poses
 
 POSE_KEYS = tuple(f"{frame}_pose" for frame in FRAMES)
 PINCH_KEYS = ("left_pinch", "right_pinch")

@@ -12,9 +12,8 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import XopError
 from xop_lerobot.core.state import FRAMES
-from xop_lerobot.core.transforms import quat_from_rpy
+from xop_lerobot.core.transforms import compute_minimum_jerk, interpolate_poses, quat_from_rpy
 from xop_lerobot.core.yaml_words import load_yaml
-from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
 from xop_lerobot.operator.recording import FARTHEST_M, describe_distance
 
 SCRIPTS = Path(__file__).parent / "scripts"

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 import trimesh.visual
 
-from xop_lerobot.plant.gl import has_display
+from xop_lerobot.plant.rendering import has_display
 
 logger = logging.getLogger(__name__)
 

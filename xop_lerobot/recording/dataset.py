@@ -27,9 +27,8 @@ from xop_lerobot.core.shutdown import hold_signals
 from xop_lerobot.core.state import RobotState
 from xop_lerobot.core.versions import read_versions
 from xop_lerobot.operator.display import Cue, Progress, Wish
-from xop_lerobot.recording import durability
+from xop_lerobot.recording import writer
 from xop_lerobot.recording.columns import Columns, has_all_columns, is_own_column
-from xop_lerobot.recording.embedding import skip_embedding
 from xop_lerobot.recording.executed import put_executed
 from xop_lerobot.recording.facts import (
     FACT_COLUMNS,
@@ -40,7 +39,7 @@ from xop_lerobot.recording.facts import (
     keep_config,
     to_plain,
 )
-from xop_lerobot.recording.requests import grant
+from xop_lerobot.recording.requests import Tally, grant
 from xop_lerobot.recording.resume import check_resumable
 from xop_lerobot.recording.rollback import (
     Checkpoint,
@@ -49,9 +48,7 @@ from xop_lerobot.recording.rollback import (
     check_pictures,
     find_reason,
 )
-from xop_lerobot.recording.schedule import keep_schedule
-from xop_lerobot.recording.tally import Tally
-from xop_lerobot.recording.video_queue import VideoQueue
+from xop_lerobot.recording.writer import VideoQueue, keep_schedule, skip_embedding
 from xop_lerobot.session import RobotInfo, Session, TickRecord, get_session
 
 logger = logging.getLogger(__name__)
@@ -479,7 +476,7 @@ class XopDataset(LeRobotDataset):
         self._session.progress = None
         if self._session.recorder is self:
             self._session.recorder = None
-        durability.forget_rotation(self)
+        writer.forget_rotation(self)
         if self._own_root and self.num_episodes == 0:
             shutil.rmtree(self.root, ignore_errors=True)
 
@@ -489,8 +486,8 @@ class XopDataset(LeRobotDataset):
         self._session.begin_episode(index)
 
     def _secure(self) -> None:
-        if durability.can_rotate(self):
-            durability.rotate_writers(self)
+        if writer.can_rotate(self):
+            writer.rotate_writers(self)
             return
         kept = {name: value for name, value in vars(self).items() if name in _KEPT}
         LeRobotDataset.finalize(self)

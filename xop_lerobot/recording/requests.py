@@ -3,9 +3,72 @@
 from __future__ import annotations
 
 from collections.abc import MutableMapping
+from typing import Any
 
+from xop_lerobot.core.state import RobotState
 from xop_lerobot.operator.display import Cue, Wish
-from xop_lerobot.recording.tally import Tally
+from xop_lerobot.session import TickRecord
+
+
+class Tally:
+    """Counts, times and flags of the episode that is being recorded.
+
+    Attributes:
+        frames: Frames so far.
+        start_time: Host clock at the first frame [s since the epoch].
+        first: Performance counter at the first frame [s].
+        last: The same at the last frame [s].
+        success: Whether the task is accomplished.
+        marked: The same as the operator has marked it, None where nobody has.
+        driven: Whether somebody has driven the robot.
+        fallen: Whether the robot fell.
+        collision: Whether it touched anything but the ground.
+        finished: Whether the operator's recording has played out.
+        task: The task in words.
+        settings: What was in force at the first frame.
+        changes: What came into force, or went wrong with the robot, and with which frame.
+    """
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.start_time = 0.0
+        self.last = self.first = 0.0
+        self.success = self.fallen = self.collision = self.finished = False
+        self.marked: bool | None = None
+        self.driven = False
+        self.task = ""
+        self.settings: dict[str, Any] = {}
+        self.changes: list[dict[str, Any]] = []
+        self._trouble = ""
+
+    def note_changes(self, tick: TickRecord) -> None:
+        """Take down what came into force with the frame that is being added."""
+        if self.frames == 0:
+            self.settings = dict(tick.settings)
+        for change in tick.changes:
+            self.changes.append({"frame": self.frames, "time": tick.state.time, **change.to_dict()})
+
+    def note_state(self, state: RobotState) -> None:
+        """Take down what has become of the robot by the frame that is being added."""
+        self.fallen |= state.fallen
+        self.collision |= state.collision
+        if state.trouble and state.trouble != self._trouble:
+            self._note(self.frames, state.time, "robot", {"trouble": state.trouble})
+        self._trouble = state.trouble
+
+    def mark(self, success: bool, time: float) -> None:
+        """Take down what the operator says of the episode, at `time` [s] of the robot's clock."""
+        self.marked = self.success = success
+        self._note(max(self.frames - 1, 0), time, "operator", {"success": success})
+
+    def _note(self, frame: int, time: float, source: str, change: dict[str, Any]) -> None:
+        self.changes.append({"frame": frame, "time": time, "source": source, "change": change})
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of the host clock, 0 for a single frame."""
+        span = self.last - self.first
+        return (self.frames - 1) / span if span > 0 else 0.0
 
 
 def grant(

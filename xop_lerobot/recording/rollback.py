@@ -16,8 +16,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from xop_lerobot.core.command_line import say_count
 from xop_lerobot.core.errors import XopError
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.recording.facts import EPISODES_FILE
 
 if TYPE_CHECKING:

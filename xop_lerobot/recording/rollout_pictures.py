@@ -12,8 +12,8 @@ import functools
 import logging
 from typing import TYPE_CHECKING, Any
 
+from xop_lerobot.core.command_line import report_mistakes
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.core.mistakes import report_mistakes
 from xop_lerobot.recording.host import find
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ import logging
 
 import mujoco
 
+from xop_lerobot.core.command_line import say_count
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.core.wording import say_count
 from xop_lerobot.low_level.policy import LowLevelPolicy
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from xop_lerobot.core.transforms import make_pose, quat_conjugate, quat_from_yaw, quat_rotate
-from xop_lerobot.operator.view import SeenObject
+from xop_lerobot.operator.display import SeenObject
 from xop_lerobot.tasks import furniture
+from xop_lerobot.tasks.furniture import ROBOT, Touching, compute_speed, compute_tilt
 from xop_lerobot.tasks.heights import HeightRange
-from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import (
     find_palms,
     make_direction,
@@ -20,8 +20,7 @@ from xop_lerobot.tasks.layout import (
     measure_pad,
     measure_reach,
 )
-from xop_lerobot.tasks.task import Task, TaskStatus
-from xop_lerobot.tasks.touching import ROBOT, Touching, compute_speed, compute_tilt
+from xop_lerobot.tasks.task import Hold, Task, TaskStatus
 
 if TYPE_CHECKING:
     import mujoco

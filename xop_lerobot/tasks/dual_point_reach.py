@@ -11,8 +11,8 @@ from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.tasks.dual_point_touch import DualPointTouch
 from xop_lerobot.tasks.furniture import place
 from xop_lerobot.tasks.heights import HeightRange
-from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import make_direction
+from xop_lerobot.tasks.task import Hold
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from xop_lerobot.core.transforms import quat_from_yaw
-from xop_lerobot.operator.view import SeenObject
+from xop_lerobot.operator.display import SeenObject
 from xop_lerobot.tasks.furniture import add_furniture_body, add_look, get_body_pose, place
 from xop_lerobot.tasks.heights import HeightRange
-from xop_lerobot.tasks.hold import Hold
 from xop_lerobot.tasks.layout import find_palms, find_room, make_direction, measure_reach
-from xop_lerobot.tasks.task import Task, TaskStatus
+from xop_lerobot.tasks.task import Hold, Task, TaskStatus
 
 if TYPE_CHECKING:
     import mujoco

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-from xop_lerobot.core.transforms import make_pose, pose_multiply
+from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_matrix
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arms.ik import ArmIk
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
+
+if TYPE_CHECKING:
+    import mujoco
 
 DRAW_IN = 0.12
 """Farther than this nobody draws in hands [m]."""
@@ -173,3 +177,23 @@ def measure_pad(morphology: Morphology) -> Pad:
     alike = [pad for pad in pads if pad[0] > farthest - 0.02]  # in the docstring
     depth, _, forward = max(alike, key=lambda pad: pad[1])
     return Pad(forward, depth, wrist_end)
+
+
+NAME = "task"
+OPEN = ((2.6, -2.2, 1.9), (0.2, 0.1, 0.6), 45.0)
+"""Where the camera is, what it looks at [m], and its vertical field of view [deg]."""
+IN_ROOM = ((2.1, -2.1, 2.4), (0.0, 0.0, 0.5), 66.0)
+"""The same in a room of 4.4 m and more: in its corner, under the ceiling."""
+
+
+def add_task_camera(spec: mujoco.MjSpec) -> None:
+    """Add the camera `task`, which stands still."""
+    has_walls = any(geom.name.startswith("wall_") for geom in spec.geoms)
+    position, target, fovy = IN_ROOM if has_walls else OPEN
+    # MuJoCo's cameras look along -Z with Y up.
+    back = np.subtract(position, target)
+    back = back / np.linalg.norm(back)
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(back, right), back], axis=1)
+    spec.worldbody.add_camera(name=NAME, pos=position, quat=quat_from_matrix(axes), fovy=fovy)

@@ -9,12 +9,11 @@ import numpy as np
 
 from xop_lerobot.core.command import RobotAction
 from xop_lerobot.morphology.scene import build_scene_spec
-from xop_lerobot.operator.view import View
+from xop_lerobot.operator.display import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
-from xop_lerobot.tasks.camera import add_task_camera
-from xop_lerobot.tasks.layout import find_palms
+from xop_lerobot.tasks.layout import add_task_camera, find_palms
 from xop_lerobot.tasks.task import Task, TaskStatus, make_task
 
 if TYPE_CHECKING:

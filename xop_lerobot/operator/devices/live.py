@@ -20,7 +20,7 @@ from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.one_euro import OneEuro, make_one_euro
-from xop_lerobot.operator.stream_guard import GuardConfig, StreamGuard
+from xop_lerobot.operator.stream import GuardConfig, StreamGuard
 from xop_lerobot.operator.webxr.pairing import MAX_RATE
 
 logger = logging.getLogger(__name__)

@@ -6,6 +6,7 @@ import numpy as np
 
 from xop_lerobot.core.errors import NotConnected
 from xop_lerobot.core.transforms import (
+    compute_heading,
     make_pose,
     quat_exp,
     quat_from_yaw,
@@ -13,9 +14,8 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
 )
 from xop_lerobot.operator.devices.config import DeviceConfig
-from xop_lerobot.operator.devices.player import Player
+from xop_lerobot.operator.devices.replay import Player
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.operator.script import Script, load_script
 

@@ -19,11 +19,10 @@ from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.live import SILENT_S, LiveDevice, StreamStatus
 from xop_lerobot.operator.display import Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.webxr.addresses import is_loopback, make_url
+from xop_lerobot.operator.webxr.addresses import is_loopback, list_hosts, make_url, write_invitation
 from xop_lerobot.operator.webxr.certificate import Certificate, get_certificate
 from xop_lerobot.operator.webxr.client import Client
 from xop_lerobot.operator.webxr.delay_meter import DelayMeter
-from xop_lerobot.operator.webxr.invitation import list_hosts, write_invitation
 from xop_lerobot.operator.webxr.pairing import check_code, make_code
 from xop_lerobot.operator.webxr.pictures import Picture, PictureEncoder
 from xop_lerobot.operator.webxr.protocol import PORT, FrameMessage, write_display, write_pose

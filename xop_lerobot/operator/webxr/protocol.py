@@ -20,7 +20,7 @@ from xop_lerobot.core.transforms import make_pose, quat_from_matrix, quat_multip
 from xop_lerobot.operator.axes import WORLD
 from xop_lerobot.operator.display import Display, Wish
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.stream_guard import NORM_TOLERANCE, OPEN_PINCH
+from xop_lerobot.operator.stream import NORM_TOLERANCE, OPEN_PINCH
 
 VERSION = 1
 PORT = 8012

@@ -16,8 +16,7 @@ from xop_lerobot.core.paced_log import PacedLog
 from xop_lerobot.operator.display import Wish
 from xop_lerobot.operator.webxr.certificate import Certificate
 from xop_lerobot.operator.webxr.client import Client
-from xop_lerobot.operator.webxr.connections import Connections, Handler
-from xop_lerobot.operator.webxr.pairing import Door
+from xop_lerobot.operator.webxr.pairing import Connections, Door, Handler
 from xop_lerobot.operator.webxr.pictures import Picture
 from xop_lerobot.operator.webxr.protocol import (
     MAX_MESSAGE,

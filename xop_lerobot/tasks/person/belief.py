@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from xop_lerobot.core.transforms import quat_from_yaw, quat_multiply, quat_rotate, wrap_angle
-from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.core.transforms import (
+    compute_heading,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+    wrap_angle,
+)
 
 
 class Belief:

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from xop_lerobot.core.transforms import (
+    compute_minimum_jerk,
+    interpolate_poses,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -18,7 +20,6 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
 )
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_minimum_jerk, interpolate_poses
 from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.tasks.person.person import Person
 

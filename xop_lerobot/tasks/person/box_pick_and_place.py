@@ -7,8 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.transforms import quat_conjugate, quat_rotate, quat_yaw, wrap_angle
-from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.core.transforms import (
+    compute_heading,
+    quat_conjugate,
+    quat_rotate,
+    quat_yaw,
+    wrap_angle,
+)
 from xop_lerobot.tasks.person.body import SIDES, TRUNK, relaxed_hands, stand_upright
 from xop_lerobot.tasks.person.grasping import (
     CARRY_SPEED,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices.config import DeviceConfig
+from xop_lerobot.operator.display import View
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.view import View
 from xop_lerobot.tasks.person.intentions import INTENTIONS, PREPARATIONS
 from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.core.transforms import compute_heading
 from xop_lerobot.tasks.person.body import SIDES
 from xop_lerobot.tasks.person.hands import (
     compute_bend,

@@ -8,8 +8,7 @@ from collections.abc import Generator
 
 import numpy as np
 
-from xop_lerobot.core.transforms import make_pose, quat_from_matrix, quat_yaw
-from xop_lerobot.operator.interpolation import compute_heading
+from xop_lerobot.core.transforms import compute_heading, make_pose, quat_from_matrix, quat_yaw
 from xop_lerobot.tasks.person.body import SIDES
 from xop_lerobot.tasks.person.hands import (
     compute_errors,

@@ -7,11 +7,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_yaw, quat_multiply
+from xop_lerobot.core.transforms import (
+    compute_heading,
+    make_pose,
+    pose_multiply,
+    quat_from_yaw,
+    quat_multiply,
+)
+from xop_lerobot.operator.display import View
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.operator.noise import HumanNoise
-from xop_lerobot.operator.view import View
 from xop_lerobot.tasks.person.belief import Belief
 from xop_lerobot.tasks.person.body import SIDES, Body
 from xop_lerobot.tasks.person.perception import Perception

@@ -8,6 +8,7 @@ import numpy as np
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import (
+    compute_heading,
     make_pose,
     quat_from_rpy,
     quat_from_yaw,
@@ -16,7 +17,6 @@ from xop_lerobot.core.transforms import (
     quat_yaw,
     wrap_angle,
 )
-from xop_lerobot.operator.interpolation import compute_heading
 from xop_lerobot.tasks.person.body import SIDES
 from xop_lerobot.tasks.person.hands import take_posture
 from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind

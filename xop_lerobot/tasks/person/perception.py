@@ -8,6 +8,7 @@ import numpy as np
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import (
+    compute_heading,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -20,8 +21,7 @@ from xop_lerobot.core.transforms import (
     quat_to_rpy,
     wrap_angle,
 )
-from xop_lerobot.operator.interpolation import compute_heading
-from xop_lerobot.operator.view import SeenObject, View
+from xop_lerobot.operator.display import SeenObject, View
 from xop_lerobot.tasks.person.person import Person
 
 WINDOW = 0.4

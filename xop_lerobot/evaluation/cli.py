@@ -98,7 +98,7 @@ def make_study(args: argparse.Namespace) -> list[Any]:
         UnknownName: If a name is unknown, listing the known ones.
         BadValue: If nothing is left of a study, or a value is out of its range.
     """
-    from xop_lerobot.evaluation.study_file import load_study, make_cells  # noqa: PLC0415
+    from xop_lerobot.evaluation.study import load_study, make_cells  # noqa: PLC0415
     from xop_lerobot.plant.config import NOISE_PRESETS  # noqa: PLC0415
 
     if args.noise is not None and args.noise not in NOISE_PRESETS:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.evaluation.intervals import compute_mean_interval, compute_rate_interval
+from xop_lerobot.evaluation.summary import compute_mean_interval, compute_rate_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
