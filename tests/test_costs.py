@@ -21,7 +21,9 @@ from xop_lerobot.core.transforms import (
     quat_yaw,
 )
 from xop_lerobot.morphology.tuning import CostWeights
+from xop_lerobot.recording.columns import COST_NAMES
 from xop_lerobot.retarget.costs import (
+    COSTS,
     CollisionCost,
     ControlCost,
     Evaluation,
@@ -523,3 +525,10 @@ def test_the_documented_defaults_are_the_real_ones():
     used = {name for name, value in actual.items() if value}
     assert used <= set(documented), "docs/retargeter.md lacks a weight of CostWeights"
     assert documented.items() <= actual.items(), "docs/retargeter.md is behind CostWeights"
+
+
+def test_datasets_list_the_terms_in_an_order_that_stays():
+    names = [cost.name for cost in COSTS]
+    first = ["tracking", "stance", "collision", "upright", "control", "change", "terminal"]
+    assert names[: len(first) + 3] == [*first, "support", "lateral", "fall"]
+    assert (*names, "total") == COST_NAMES

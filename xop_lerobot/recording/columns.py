@@ -15,13 +15,11 @@ import numpy as np
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.state import FRAMES, RobotState
 from xop_lerobot.morphology.body import Body
+from xop_lerobot.retarget.costs import COSTS
 from xop_lerobot.session import Outcome, RobotInfo, TickRecord
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
-COST_NAMES = (
-    "tracking", "stance", "collision", "upright", "control", "change", "terminal", "support",
-    "lateral", "fall", "total",
-)  # fmt: skip
+COST_NAMES = (*(cost.name for cost in COSTS), "total")
 """Terms of `retargeter.cost`; a term that a retargeter does not have is 0."""
 HEALTH_NAMES = (
     "solve_time", "plan_age", "effective_samples", "status", "sync_residual", "sync_status",

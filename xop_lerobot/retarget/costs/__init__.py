@@ -10,10 +10,11 @@ from xop_lerobot.retarget.costs.balance import (
 from xop_lerobot.retarget.costs.collision import CollisionCost
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.costs.effort import ChangeCost, ControlCost
-from xop_lerobot.retarget.costs.factory import make_costs
+from xop_lerobot.retarget.costs.factory import COSTS, make_costs
 from xop_lerobot.retarget.costs.tracking import TerminalCost, TrackingCost, UprightCost
 
 __all__ = [
+    "COSTS",
     "ChangeCost",
     "CollisionCost",
     "ControlCost",

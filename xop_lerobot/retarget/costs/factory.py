@@ -1,4 +1,4 @@
-"""Makes the cost terms of a robot."""
+"""The list of cost terms, and how those of a robot are made."""
 
 from __future__ import annotations
 
@@ -22,6 +22,21 @@ if TYPE_CHECKING:
     from xop_lerobot.retarget.model.command_model import CommandModel
 
 
+COSTS: tuple[type[Cost], ...] = (
+    TrackingCost,
+    StanceCost,
+    CollisionCost,
+    UprightCost,
+    ControlCost,
+    ChangeCost,
+    TerminalCost,
+    SupportCost,
+    LateralCost,
+    FallCost,
+)
+"""All terms; datasets list them in this order, so a new one comes last."""
+
+
 def make_costs(
     morphology: Morphology,
     command_model: CommandModel,
@@ -30,9 +45,9 @@ def make_costs(
     fall: FallCost,
     load: StaticLoad | None = None,
 ) -> tuple[Cost, ...]:
-    """Make all terms; those that a robot has no use for cost nothing."""
+    """Make all of `COSTS`; those that a robot has no use for cost nothing."""
     space = command_model.space
-    return (
+    costs = (
         TrackingCost(),
         TerminalCost(),
         StanceCost(morphology.contact_groups, morphology.wheeled),
@@ -44,3 +59,5 @@ def make_costs(
         LateralCost(command_model.is_nonholonomic),
         fall,
     )
+    assert {type(cost) for cost in costs} == set(COSTS)
+    return costs
