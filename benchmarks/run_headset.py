@@ -76,7 +76,7 @@ def send_frames(port: int, seconds: float, rate: float) -> None:
 def send_from_browser(port: int, seconds: float, rate: float, origin: Any) -> None:
     """Be a headset in Chromium, which has its own rate; `origin` is when its clock began [s]."""
     del rate
-    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "helpers"))
     import headset
     from browser import launch
 

@@ -63,7 +63,7 @@ COMPILER_PACKAGES = {
 }
 PYTHON_HEADERS = {"apt-get": "python{}-dev", "dnf": "python{}-devel", "zypper": "python{}-devel"}
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-"""Programs that `tests/browser.py` starts, whichever is found first."""
+"""Programs that `tests/helpers/browser.py` starts, whichever is found first."""
 TEST_PACKAGES = {
     "apt-get": {"Chromium": "chromium", "certutil": "libnss3-tools", "npm": "npm"},
     "dnf": {"Chromium": "chromium", "certutil": "nss-tools", "npm": "npm"},

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from test_teleoperation import OPEN, Person, Rig, robots
 
+from tests.test_teleoperation import OPEN, Person, Rig, robots
 from xop_lerobot.core.transforms import make_pose, quat_from_rpy
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.frame import OperatorFrame
