@@ -64,7 +64,7 @@ def run_verb(words: list[str]) -> tuple[int, str]:
 
 def main() -> int:
     """Run all, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--root", type=Path, required=True, help="what make_mixed_dataset.py made")
     settings = parser.parse_args()
     failed = 0

@@ -27,7 +27,7 @@ from xop_lerobot.core.errors import XopError
 
 def main() -> None:
     """Measure, print, and write the plot if asked to."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("recordings", nargs="+", type=Path, help=".npz recordings of people")
     parser.add_argument("--seeds", type=int, default=4, help="simulated people")
     parser.add_argument("--plot", type=Path, help="file of the plot, .png or .svg")

@@ -64,7 +64,7 @@ def measure(command: list[str]) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--episodes", default="10,100,1000", help="numbers of episodes")
     parser.add_argument("--frames", type=int, default=9000, help="frames of an episode")
     parser.add_argument("--seed", type=int, default=0)

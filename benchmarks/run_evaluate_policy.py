@@ -123,7 +123,7 @@ def print_table(result: dict[str, Any]) -> None:
 
 def main() -> None:
     """Evaluate, print, and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rollouts", nargs="+", required=True, metavar="NAME=DIRECTORY")
     parser.add_argument("--at", type=float, default=6.0, help="judged so late in an episode [s]")
     parser.add_argument("--margin", type=float, help="asked for, over each other one [m]")

@@ -21,7 +21,7 @@ def main() -> int:
     """Run and print; return 1 if something was disturbed."""
     import fuzzing
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--bytes", type=int, default=10_000_000, help="bytes for each port")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--ports", nargs="+", choices=PORTS, default=PORTS)

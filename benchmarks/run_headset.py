@@ -229,7 +229,7 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--robot", choices=list(POLICIES), default="g1")
     parser.add_argument("--retargeter", choices=["direct", "mpc"], default="direct")
     parser.add_argument("--fps", type=int, default=25, help="rate of the control loop [Hz]")

@@ -27,7 +27,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 from tqdm import tqdm
@@ -243,7 +243,8 @@ class Recorder:
         self._session.begin_episode(index)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "person.npz"
-            np.savez(path, **make_motion(KINDS[name], rng))
+            motion: dict[str, Any] = dict(make_motion(KINDS[name], rng))
+            np.savez(path, **motion)
             teleop = self._make_teleop(str(path))
             teleop.connect()
         events = {"exit_early": False}
@@ -307,7 +308,7 @@ def make_killed_stock(source: Path, root: Path) -> None:
         rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="ultrafast"),
     )
     for row in range(frames.num_frames):
-        item = frames[row]
+        item: dict[str, Any] = cast("dict[str, Any]", frames[row])
         episode, frame = int(item["episode_index"]), int(item["frame_index"])
         if frame == 0 and row:
             copy.save_episode()

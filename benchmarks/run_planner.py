@@ -15,7 +15,7 @@ from xop_lerobot.core.command_line import make_output_readable
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--repeats", type=int, default=300, help="solves per planner and row")
     parser.add_argument("--seed", type=int, default=0)
     settings = parser.parse_args()

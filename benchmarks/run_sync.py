@@ -210,7 +210,7 @@ def print_table(title: str, errors: dict[str, Errors]) -> None:
 
 def main() -> None:
     """Run the cases and print their tables."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--noise", default="mild", help="noise preset of the sensors")
     parser.add_argument("--seeds", type=int, default=3, help="episodes per case, seeds 0, 1, …")
     parser.add_argument("--duration", type=float, default=12.0, help="of an episode [s]")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -47,14 +48,14 @@ def make_panels() -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
     }
 
 
-def draw_axes(ax: plt.Axes, origin: np.ndarray, axes: np.ndarray, names: str) -> None:
+def draw_axes(ax: Any, origin: np.ndarray, axes: np.ndarray, names: str) -> None:
     """Draw three axes as arrows."""
     for column, colour, name in zip(axes.T, COLOURS, names, strict=True):
         ax.quiver(*origin, *(LENGTH * column), color=colour, arrow_length_ratio=0.22, lw=2)
         ax.text(*(origin + 1.2 * LENGTH * column), name, color=colour, ha="center", va="center")
 
 
-def draw_person(ax: plt.Axes) -> None:
+def draw_person(ax: Any) -> None:
     """Draw a head that looks along X, and hands with the palms down."""
     u, v = np.mgrid[0 : 2 * np.pi : 16j, 0 : np.pi : 9j]
     head = 0.09 * np.array([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), 1.25 * np.cos(v)])
@@ -70,12 +71,12 @@ def draw_person(ax: plt.Axes) -> None:
 
 def main() -> None:
     """Draw all panels."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="PNG file to write")
     out = parser.parse_args().out
     figure = plt.figure(figsize=(13, 3.6))
     for i, (title, (world, frames)) in enumerate(make_panels().items(), start=1):
-        ax = figure.add_subplot(1, 4, i, projection="3d")
+        ax: Any = figure.add_subplot(1, 4, i, projection="3d")
         ax.set_title(title, fontsize=10)
         draw_person(ax)
         names = "XYZ" if i == 1 else "xyz"
