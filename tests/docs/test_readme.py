@@ -23,7 +23,7 @@ from xop_lerobot.evaluation.bench import parse_arguments as parse_bench
 from xop_lerobot.operator.recording import load_recording
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 COMMANDS = re.compile(r"(lerobot-[a-z-]+|xop-[a-z]+|make [a-z]+)\b")
 
 
