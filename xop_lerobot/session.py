@@ -17,6 +17,7 @@ import numpy as np
 
 from xop_lerobot.core.errors import LinkError
 from xop_lerobot.core.state import Goal, RobotState
+from xop_lerobot.morphology.morphology import list_robot_types
 from xop_lerobot.operator.display import Cue, Progress, View, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 
@@ -219,8 +220,8 @@ class Session:
         """
         if not self._robots:
             raise LinkError(
-                f"no xop robot in session '{self.name}'. Use --robot.type=xop_g1 or xop_rby1 with "
-                f"--robot.session={self.name}, the same as --teleop.session."
+                f"no xop robot in session '{self.name}'. Use --robot.type={list_robot_types()} "
+                f"with --robot.session={self.name}, the same as --teleop.session."
             )
         if len(self._robots) > 1:
             names = ", ".join(info.name for info in self._robots)

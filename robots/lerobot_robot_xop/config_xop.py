@@ -9,6 +9,7 @@ from lerobot.robots.config import RobotConfig
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.yaml_words import fill_nulls, find_text, find_word, recover_typed
+from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
 from xop_lerobot.recording.rollout_pictures import watch_rollouts
 from xop_lerobot.tasks.heights import parse_heights
@@ -111,7 +112,7 @@ class XopRobotConfig(RobotConfig):
         """
         if self.sim.scene or not self.task:
             return self.sim.scene or "empty"
-        return get_task(self.task).scenes.get(self.morphology, "empty")
+        return get_task(self.task).choose_scene(make_morphology(self.morphology))
 
     def make_simulation_config(self) -> SimulationConfig:
         """Make the configuration of the simulated plant.

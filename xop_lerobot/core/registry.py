@@ -24,6 +24,11 @@ class Registry[T]:
         self._places = dict(places or {})
         self._things: dict[str, T] = {}
 
+    @property
+    def built_in(self) -> tuple[str, ...]:
+        """Names of the things of this project, without those that were added."""
+        return tuple(sorted(self._places))
+
     def add(self, name: str, thing: T) -> T:
         """Register `thing` under `name`.
 

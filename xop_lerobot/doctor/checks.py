@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from xop_lerobot.morphology.morphology import MORPHOLOGIES
 from xop_lerobot.plant.rendering import choose_backends
 
 
@@ -110,7 +111,7 @@ class Setup:
     port: int = 0
     seconds: float = 3.0
     wait: float = 60.0
-    robot: str = "g1"
+    robot: str = MORPHOLOGIES.built_in[0]
     mode: str = "stationary"
     root: Path = Path()
 
@@ -472,7 +473,10 @@ def _measure(device, seconds: float) -> Finding:  # noqa: ANN001  a LiveDevice, 
     return Finding(Level.OK, text, "", figures)
 
 
-WANTED = {"robots": ("xop_g1", "xop_rby1"), "teleoperators": ("xop",)}
+WANTED = {
+    "robots": tuple(f"xop_{name}" for name in MORPHOLOGIES.built_in),
+    "teleoperators": ("xop",),
+}
 _PLUGIN_CODE = """
 import json
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -504,4 +508,6 @@ def check_plugin(setup: Setup) -> Finding:
             "for a warning of LeRobot's about a plugin that it could not import",
             {"missing": missing},
         )
-    return Finding(Level.OK, "LeRobot knows xop_g1, xop_rby1 and the teleoperator xop")
+    return Finding(
+        Level.OK, f"LeRobot knows {', '.join(WANTED['robots'])} and the teleoperator xop"
+    )

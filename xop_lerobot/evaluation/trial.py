@@ -86,7 +86,7 @@ class TrialSetup:
         return dataclasses.replace(
             self,
             low_level=resolve_low_level(morphology, self.method, self.low_level),
-            scene=self.scene or task.scenes.get(self.robot, "empty"),
+            scene=self.scene or task.choose_scene(task.morphology),
         )
 
 

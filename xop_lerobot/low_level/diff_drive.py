@@ -59,9 +59,10 @@ class DiffDrive(LowLevelPolicy):
         if path is not None:
             raise PolicyFileError(f"low-level policy 'diff_drive' has no file, got '{path}'")
         if morphology is None:
-            from xop_lerobot.morphology.morphology import make_morphology  # noqa: PLC0415
+            from xop_lerobot.morphology.morphology import MORPHOLOGIES  # noqa: PLC0415
 
-            morphology = make_morphology("rby1")
+            robots = (MORPHOLOGIES[name]() for name in MORPHOLOGIES.built_in)
+            morphology = next(robot for robot in robots if self.name in robot.policies)
         model = morphology.build_spec("planning").compile()
         actuators = [model.actuator(i).name for i in range(model.nu)]
         commands, arms = morphology.command_space.names, morphology.arm_names

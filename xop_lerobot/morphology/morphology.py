@@ -68,6 +68,21 @@ class Variant:
     paper: Mapping[Mode, PaperParameters] = field(default_factory=lambda: PAPER_HUMANOID)
 
 
+@dataclass(frozen=True)
+class Work:
+    """What tasks have to know of a robot's hands beyond their kinematics.
+
+    Attributes:
+        press: How far inside a box wrist goals have to be for a grip that holds [m].
+        tray: Whether a hand needs a plate to carry what lies on it.
+        walk: How far the robot goes before it carries something, at least and at most [m].
+    """
+
+    press: float = 0.05
+    tray: bool = False
+    walk: tuple[float, float] = (0.0, 0.0)
+
+
 class Morphology(ABC):
     """A robot, as far as retargeting is concerned. One folder per robot, no other code knows it.
 
@@ -100,6 +115,8 @@ class Morphology(ABC):
 
     ramps: bool = False
     """Whether its controller goes from each set of targets to the next in a straight line."""
+    work: Work = Work()
+    """What tasks have to know of its hands."""
     variants: Mapping[str, Variant] = {"v1": Variant()}
     """Bindings of targets to the body by name; the first is the default."""
     effects: tuple[Effect, ...]
@@ -196,6 +213,11 @@ MORPHOLOGIES: Registry[type[Morphology]] = Registry(
 def list_robots() -> tuple[str, ...]:
     """Names of the known robots."""
     return tuple(MORPHOLOGIES)
+
+
+def list_robot_types() -> str:
+    """LeRobot types of this project's robots, as an error names them: ``"xop_g1 or xop_rby1"``."""
+    return " or ".join(f"xop_{name}" for name in MORPHOLOGIES.built_in)
 
 
 def make_morphology(name: str) -> Morphology:

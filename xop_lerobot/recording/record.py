@@ -47,6 +47,7 @@ from lerobot_teleoperator_xop.terminal import listen_while_recording
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm
+from xop_lerobot.morphology.morphology import list_robot_types
 from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.host import count_ticks
 from xop_lerobot.recording.resume import check_storage
@@ -211,7 +212,7 @@ def check_types(config: XopRecordConfig) -> tuple[XopRobotConfig, XopConfig]:
     if isinstance(robot, XopRobotConfig) and isinstance(teleop, XopConfig):
         return robot, teleop
     raise BadValue(
-        "xop-record takes --robot.type=xop_g1 or xop_rby1 and --teleop.type=xop, got "
+        f"xop-record takes --robot.type={list_robot_types()} and --teleop.type=xop, got "
         f"{robot.type} and {teleop.type if teleop else 'none'}. Use lerobot-record for others"
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -86,7 +86,7 @@ class BoxPickAndPlace(Task):
     name = "box_pick_and_place"
     instruction = "Pick up the box with both hands and put it on the green mark of the table."
     time_limit = 150.0
-    scenes: ClassVar[Mapping[str, str]] = {"g1": "empty", "rby1": "small_room"}
+    room = "small_room"
     furniture = ("support", "table")
     handled = ("support", "table")
     passable = ("support_top", "table_top")
@@ -119,7 +119,7 @@ class BoxPickAndPlace(Task):
         return {
             "palm_forward": min(-self.pad.forward, -self.pad.wrist_end - BOX[0] - WRIST_GAP),
             "palm_outside": self.pad.depth,
-            "press": PRESS.get(self.morphology.name, 0.05),
+            "press": self.morphology.work.press,
             "draw_in": self._draw_in,
         }
 
@@ -241,7 +241,3 @@ class BoxPickAndPlace(Task):
         spot = table[:3] + quat_rotate(table[3:], np.array([self._spot_offset, 0, 0]))
         seen["spot"] = SeenObject(make_pose(spot, table[3:]), np.array([BOX[0], BOX[1], 0]))
         return seen
-
-
-PRESS = {"g1": 0.02, "rby1": 0.01}
-"""How far inside wrist goals have to be for a grip that holds, by robot [m]; see docs/tasks.md."""

@@ -45,7 +45,7 @@ class DualPointReach(DualPointTouch):
     name = "dual_point_reach"
     instruction = "Reach for the red point with the left palm and for the blue one with the right."
     time_limit = 20.0
-    scenes = {}
+    room = "empty"
 
     def __init__(self, morphology: Morphology) -> None:
         super().__init__(morphology)

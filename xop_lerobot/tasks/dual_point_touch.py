@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class DualPointTouch(Task):
     name = "dual_point_touch"
     instruction = "Touch the red point with the left palm and the blue one with the right."
     time_limit = 90.0
-    scenes: ClassVar[Mapping[str, str]] = {"g1": "empty", "rby1": "small_room"}
+    room = "small_room"
 
     def __init__(self, morphology: Morphology) -> None:
         super().__init__(morphology)

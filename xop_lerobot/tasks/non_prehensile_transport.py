@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -41,8 +41,6 @@ WALL, DEPTH = 0.008, 0.12
 OBSTACLE = (0.02, 0.05)
 """Half the thickness of the obstacles across the way, and half their breadth along X [m]."""
 
-WALK = {"g1": (0.5, 0.7)}
-"""How far the robot has to walk or drive first [m]; others have the container in reach."""
 WALK_BEARING = 0.3
 """Bearing of that way [rad], at most to either side."""
 AHEAD = (0.0, 0.08)
@@ -80,7 +78,7 @@ class NonPrehensileTransport(Task):
     name = "non_prehensile_transport"
     instruction = "Carry the toy on the open left palm past the obstacles and drop it into the box."
     time_limit = 60.0
-    scenes: ClassVar[Mapping[str, str]] = {"g1": "empty", "rby1": "small_room"}
+    room = "small_room"
     furniture = ("container", "obstacle_0", "obstacle_1")
     handled = ("container",)
     close_by = ("obstacle_0", "obstacle_1")
@@ -90,7 +88,7 @@ class NonPrehensileTransport(Task):
         super().__init__(morphology)
         self.reach, self.pad = measure_reach(morphology), measure_pad(morphology)
         self._held, self._inside = Hold(HELD_S), Hold(INSIDE_S)
-        self.has_tray = palm.HAS_TRAY.get(morphology.name, False)
+        self.has_tray = morphology.work.tray
         model = morphology.build_spec("full").compile()
         data = mujoco.MjData(model)
         data.qpos[:] = morphology.standing_qpos()
@@ -200,7 +198,7 @@ class NonPrehensileTransport(Task):
     def reset(self, rng: np.random.Generator) -> None:
         """Place container and obstacles; the toy is held on the palm."""
         bearing = rng.uniform(-WALK_BEARING, WALK_BEARING)
-        low, high = WALK.get(self.morphology.name, (0.0, 0.0))
+        low, high = self.morphology.work.walk
         walk = rng.uniform(low, high)
         facing = bearing if walk else 0.0
         ahead, left = make_direction(facing), make_direction(facing + math.pi / 2)

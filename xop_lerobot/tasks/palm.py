@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -83,7 +82,3 @@ def compute_tray_forward(pad: Pad) -> float:
 def compute_start(reach: Reach, left: float) -> np.ndarray:
     """Where the palm begins: as at rest, a little nearer and higher. Shape (3,)."""
     return np.array([0.92 * reach.forward, left, reach.height + 0.03])
-
-
-HAS_TRAY: Mapping[str, bool] = {"g1": False, "rby1": True}
-"""Whether a robot's hand needs the plate: G1's is flat, between the fingers of RB-Y1 is a gap."""

@@ -26,7 +26,7 @@ AFTER_SUCCESS_S = 1.0
 
 def find_scene(task: Task, scene: str = "") -> str:
     """Return `scene`, or the one that the task asks for with this robot."""
-    return scene or task.scenes.get(task.morphology.name, "empty")
+    return scene or task.choose_scene(task.morphology)
 
 
 class Stage:

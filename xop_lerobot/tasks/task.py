@@ -54,8 +54,8 @@ class Task(ABC):
     """What is to be done, in words; LeRobot's `task` of every frame."""
     time_limit: ClassVar[float]
     """Time after which an episode is over [s]."""
-    scenes: ClassVar[Mapping[str, str]] = {"g1": "empty", "rby1": "room"}
-    """Scene by robot, where none is asked for."""
+    room: ClassVar[str] = "room"
+    """Scene, where none is asked for, of robots that keep clear of walls."""
 
     furniture: tuple[str, ...] = ()
     """Bodies that stand still and that a robot may run into."""
@@ -114,6 +114,11 @@ class Task(ABC):
             low, high = self.heights[name]
             return float(rng.uniform(low + margin, high - margin))
         return about + rng.uniform(*spread)
+
+    @classmethod
+    def choose_scene(cls, morphology: Morphology) -> str:
+        """Name of the scene for a robot, where none is asked for."""
+        return cls.room if morphology.hull_points else "empty"
 
     @property
     def hints(self) -> Mapping[str, float]:

@@ -10,7 +10,7 @@ from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.g1.links import LINKS
 from xop_lerobot.morphology.g1.mpc import EFFECTS, STANDING_REACH, mpc_config
 from xop_lerobot.morphology.g1.shapes import FOOT_POINTS
-from xop_lerobot.morphology.morphology import ArmChain, ModelKind, Morphology
+from xop_lerobot.morphology.morphology import ArmChain, ModelKind, Morphology, Work
 
 if TYPE_CHECKING:
     import mujoco
@@ -115,6 +115,8 @@ class G1(Morphology):
     wheeled = False
     standing_reach = STANDING_REACH
     point_heights, top_heights = (0.25, 1.3), (0.3, 1.1)
+    # The container is out of reach of who only stands: it walks first.
+    work = Work(press=0.02, walk=(0.5, 0.7))
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
         """Build G1 alone."""

@@ -13,6 +13,7 @@ from xop_lerobot.morphology.morphology import (
     ModelKind,
     Morphology,
     Variant,
+    Work,
 )
 from xop_lerobot.morphology.rby1.links import LINKS
 from xop_lerobot.morphology.rby1.mpc import (
@@ -132,6 +133,8 @@ class RBY1(Morphology):
     posture_limits = POSTURE_LIMITS
     standing_reach = STANDING_REACH
     point_heights, top_heights = (0.25, 1.5), (0.3, 1.3)
+    # Between the fingers of its hand is a gap, through which a toy would fall.
+    work = Work(press=0.01, tray=True)
     hull_points = HULL
     hull_hands = ("left_palm", "right_palm")
     fall_height = -0.2
