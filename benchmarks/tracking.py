@@ -206,6 +206,11 @@ def run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory
     Returns:
         The goals, and what happened.
     """
+    with get_ablation(setup.ablation).replace():
+        return _run_scenario(setup, seed)
+
+
+def _run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory]:
     scenario = get_scenario(setup.scenario)
     morphology = make_tuned_morphology(setup)
     low_level = resolve_policy(morphology, setup.low_level)

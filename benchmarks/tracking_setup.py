@@ -5,9 +5,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pkgutil import resolve_name
 from typing import Any
+from unittest.mock import patch
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue, UnknownName
@@ -15,6 +19,7 @@ from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.tuning import MpcConfig
+from xop_lerobot.retarget.candidates import Intervention, Verdict
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.presets import build_configs
 
@@ -42,6 +47,8 @@ class Ablation:
         noise: Preset of the sensors' noise, None for the one that was asked for.
         equal_compute: Whether the number of samples is raised or lowered so that as many physics
             steps per second are rolled out as without the ablation.
+        replaced: Parts without a setting, as ``"module:name"``, and what makes the replacement of
+            each out of it.
     """
 
     title: str
@@ -50,6 +57,28 @@ class Ablation:
     retargeter: Mapping[str, Any] = field(default_factory=dict)
     noise: str | None = None
     equal_compute: bool = False
+    replaced: Mapping[str, Callable[[Callable[..., Any]], Callable[..., Any]]] = field(
+        default_factory=dict
+    )
+
+    @contextmanager
+    def replace(self) -> Iterator[None]:
+        """Put the replacements in place."""
+        with ExitStack() as stack:
+            for place, make in self.replaced.items():
+                owner, _, name = place.replace(":", ".").rpartition(".")
+                stock = getattr(resolve_name(owner), name)
+                stack.enter_context(patch.object(resolve_name(owner), name, make(stock)))
+            yield
+
+
+def _always(value: object) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Make replacements that do nothing and return `value`."""
+    return lambda _stock: lambda *_args, **_kwargs: value
+
+
+def _without_learning(stock: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *args, **kwargs: stock(*args, **{**kwargs, "learns": False})
 
 
 ABLATIONS: dict[str, Ablation] = {
@@ -80,6 +109,50 @@ ABLATIONS: dict[str, Ablation] = {
     ),
     "no_preview": Ablation("no goal preview", {"preview_s": 0.0}),
     "no_drift": Ablation("no drift observer", {"observe_drift": False}),
+    "no_offset": Ablation(
+        "no offset observer",
+        replaced={"xop_lerobot.retarget.model.observers:OffsetObserver.update": _without_learning},
+    ),
+    "no_change": Ablation("no cost of change", {"weights.change": 0.0}),
+    "no_support": Ablation("no support cost", {"weights.support": 0.0}),
+    "no_lean": Ablation("no cost of leaning", {"weights.lean": 0.0}),
+    "no_load": Ablation("no cost of static load", {"weights.load": 0.0}),
+    "no_lateral": Ablation("no lateral cost", {"weights.lateral": 0.0}),
+    "no_stance": Ablation("no stance cost", {"weights.stance": 0.0}),
+    "no_fall": Ablation("no fall cost", {"weights.fall": 0.0}),
+    "no_reach": Ablation("goals however far away", {"reach": math.inf}),
+    "no_previous": Ablation(
+        "no previous command as a candidate", {"candidates": Without("previous")}
+    ),
+    "no_stop": Ablation("no candidate that stops", {"candidates": Without("stop")}),
+    "two_knots": Ablation("two support points", {"num_knots": 2}),
+    "four_knots": Ablation("four support points", {"num_knots": 4}),
+    "no_intervention": Ablation(
+        "nothing is slowed or vetoed",
+        replaced={
+            "xop_lerobot.retarget.mpc:judge": _always(Verdict(Intervention.NONE, 0.0)),
+        },
+    ),
+    "no_route": Ablation(
+        "no path and no heading for wheels",
+        replaced={"xop_lerobot.retarget.guidance.guidance:Guidance._drives": _always(False)},
+    ),
+    "no_twist_room": Ablation(
+        "the waist turns as far as its joint does",
+        replaced={"xop_lerobot.retarget.guidance.guidance:TwistRoom.compute": _always(math.inf)},
+    ),
+    "no_hold": Ablation(
+        "what hands hold does not go with the body",
+        replaced={"xop_lerobot.retarget.arms.contact:ArmHold.update": _always(None)},
+    ),
+    "no_yield": Ablation(
+        "hands that squeeze give no way",
+        replaced={"xop_lerobot.retarget.arms.contact:ArmYield.update": _always(None)},
+    ),
+    "no_bias": Ablation(
+        "what arms miss is not made up for",
+        replaced={"xop_lerobot.retarget.arms.contact:ArmBias.update": _always(None)},
+    ),
     "no_ess": Ablation("raw weights, λ = 0.001", {"weighting": "raw", "temperature": 0.001}),
     "minmax": Ablation("min-max weights, λ = 0.05", {"weighting": "minmax", "temperature": 0.05}),
     "gaussian": Ablation("Gaussian samples", {"sampling": "gaussian"}),
