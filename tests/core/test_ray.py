@@ -32,7 +32,7 @@ def cluster() -> Iterator[None]:
     """A local Ray of two cores, which all tests share."""
     ray = pytest.importorskip("ray", reason="Ray is not installed; it is the extra 'ray'")
     with pytest.MonkeyPatch.context() as patch:
-        folders = ("tests", "teleoperators", "robots", ".")
+        folders = ("tests/helpers", "teleoperators", "robots", ".")
         patch.setenv("PYTHONPATH", os.pathsep.join(str(REPO / name) for name in folders))
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_worker_niceness", "0")  # by itself Ray gives way to tests beside it

@@ -108,7 +108,7 @@ def test_end_redo_mark_and_stop(tmp_path, monkeypatch, command):
     root = tmp_path / "data"
     plans = (END + ON, REDO + ON, MARK + later(END, 1.6) + later(ON, 0.6), STOP)
     more = ["--stop_on_success=false"] if command == "xop-record" else []
-    monkeypatch.setattr("test_episode_gestures.TELEOP", (*TELEOP, *more))
+    monkeypatch.setattr(f"{__name__}.TELEOP", (*TELEOP, *more))
     facts = record(monkeypatch, command, root, *plans)
     assert [row["success"] for row in facts] == [False, True, False]
     # The clock of a tick is that of its beginning; the robot settles within 1 s of its own.
@@ -157,7 +157,7 @@ def test_a_mark_ends_the_episode_where_a_success_does(tmp_path, monkeypatch):
 def test_what_nobody_has_driven_is_no_episode(tmp_path, monkeypatch, command):
     Puppet.plans = []
     rest = [(0.0, "rest", 0, 0)]
-    monkeypatch.setattr("test_episode_gestures.ENGAGE", rest)
+    monkeypatch.setattr(f"{__name__}.ENGAGE", rest)
     facts = record(monkeypatch, command, tmp_path / "data", END + later(STOP, 1.5))
     assert facts == []
     assert told() == [

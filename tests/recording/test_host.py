@@ -7,20 +7,16 @@ import logging
 import math
 import signal
 import types
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_robot import ForeignRobot, ForeignRobotConfig, ForeignTeleopConfig
 from lerobot.configs.dataset import DatasetRecordConfig
 from lerobot.datasets import LeRobotDataset
-from lerobot.robots.config import RobotConfig
-from lerobot.robots.robot import Robot
 from lerobot.rollout import context as rollout_module
 from lerobot.rollout.strategies.episodic import EpisodicStrategy
 from lerobot.scripts import lerobot_record as record_module
-from lerobot.teleoperators.config import TeleoperatorConfig
-from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.keyboard_input import apply_recording_control
 from lerobot_rows import get_row
 from toy_robot import SMALL, XopToyConfig, make_teleop, make_toy
@@ -48,78 +44,6 @@ def leave_lerobot_as_it_was():
     assert rollout_module.LeRobotDataset is STOCK_DATASET
     assert record_module.record_loop is STOCK_LOOP
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-
-
-@RobotConfig.register_subclass("foreign")
-@dataclass(kw_only=True)
-class ForeignRobotConfig(RobotConfig):
-    pass
-
-
-class ForeignDevice:
-    """What LeRobot asks of robots and teleoperators alike."""
-
-    connected, count = False, 0.0
-
-    @property
-    def action_features(self) -> dict[str, type]:
-        return {"joint.pos": float}
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    @property
-    def is_connected(self) -> bool:
-        return self.connected
-
-    def connect(self, calibrate: bool = True) -> None:
-        self.connected, self.count = True, 0.0
-
-    def disconnect(self) -> None:
-        self.connected = False
-
-    def calibrate(self) -> None:
-        pass
-
-    def configure(self) -> None:
-        pass
-
-
-class ForeignRobot(ForeignDevice, Robot):
-    config_class, name = ForeignRobotConfig, "foreign"
-    cameras: dict = {}
-
-    @property
-    def observation_features(self) -> dict[str, type]:
-        return {"joint.pos": float}
-
-    def get_observation(self):
-        self.count += 1
-        return {"joint.pos": self.count}
-
-    def send_action(self, action):
-        return action
-
-
-@TeleoperatorConfig.register_subclass("foreign")
-@dataclass(kw_only=True)
-class ForeignTeleopConfig(TeleoperatorConfig):
-    pass
-
-
-class ForeignTeleop(ForeignDevice, Teleoperator):
-    config_class, name = ForeignTeleopConfig, "foreign"
-
-    @property
-    def feedback_features(self) -> dict[str, type]:
-        return {}
-
-    def get_action(self):
-        return {"joint.pos": 0.5}
-
-    def send_feedback(self, feedback):
-        pass
 
 
 def record(robot, teleop, root: Path, **dataset):

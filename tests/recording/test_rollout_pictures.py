@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from foreign_robot import ForeignRobotConfig
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
@@ -14,7 +15,6 @@ from lerobot.scripts import lerobot_rollout
 from toy_robot import XopToyConfig
 
 from lerobot_robot_xop import XopRobotConfig
-from tests.recording.test_host import ForeignRobotConfig
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.recording.rollout_pictures import watch_rollouts
 

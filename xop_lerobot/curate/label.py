@@ -46,7 +46,7 @@ from xop_lerobot.curate.labels import (
 )
 from xop_lerobot.curate.measures import KINDS
 from xop_lerobot.curate.source import EpisodeEntry, Source
-from xop_lerobot.curate.transfer import SUBTASK, write_subtasks
+from xop_lerobot.curate.subtasks import SUBTASK, write_subtasks
 
 if TYPE_CHECKING:
     from xop_lerobot.curate.clip import Clip

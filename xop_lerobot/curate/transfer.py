@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.utils import DEFAULT_CHUNK_SIZE, DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH
 
@@ -34,6 +33,7 @@ from xop_lerobot.curate.stats import (
     pick_pictures,
     read_pictures,
 )
+from xop_lerobot.curate.subtasks import SUBTASK, read_subtasks, write_subtasks
 from xop_lerobot.curate.task_words import TASK, TASKS_FILE, read_tasks
 from xop_lerobot.curate.video import Cut, decode
 from xop_lerobot.curate.video_files import VideoFiles
@@ -50,38 +50,8 @@ from xop_lerobot.recording.facts import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
-SUBTASK = "subtask_index"
-SUBTASKS_FILE = Path("meta") / "subtasks.parquet"
-_NAME = "subtask"
-
-
-def read_subtasks(root: Path) -> dict[int, str]:
-    """Read the names of sub-tasks by number; empty where there are none.
-
-    Raises:
-        BadDataset: If the file is malformed.
-    """
-    path = root / SUBTASKS_FILE
-    if not path.is_file():
-        return {}
-    try:
-        table = pq.read_table(path).to_pydict()
-        return dict(zip(table[SUBTASK], map(str, table[_NAME]), strict=True))
-    except (pa.ArrowException, OSError, KeyError) as error:
-        raise BadDataset(root, f"{SUBTASKS_FILE} is not readable ({error})") from error
-
-
-def write_subtasks(root: Path, names: Sequence[str]) -> None:
-    """Write the names of sub-tasks, numbered from 0."""
-    import pandas as pd  # noqa: PLC0415 slow
-
-    table = pd.DataFrame({SUBTASK: range(len(names))}, index=pd.Index(names, name=_NAME))
-    table.to_parquet(root / SUBTASKS_FILE)
-
-
 __all__ = ["Clip", "NothingLeft", "Step", "Transferred", "transfer"]
 
-"""Configurations by their hash, where the episodes come from several sessions."""
 _COUNTED = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _SIZES = ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb")
 
