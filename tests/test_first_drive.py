@@ -13,6 +13,8 @@ from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.retarget.config import RetargeterConfig
 
+pytestmark = pytest.mark.slow
+
 HEAD = np.array([0.0, 0.0, 1.7])
 REST = (0.3, 0.2, -0.5)
 LET_GO_S = 8.0

@@ -180,6 +180,7 @@ def test_until_somebody_is_there_the_robot_holds(rig, name, motion):
         assert record.cost == {"total": 0}
 
 
+@pytest.mark.slow
 @robots
 def test_engaging_makes_no_step(rig, name):
     r = rig(name)
@@ -209,6 +210,7 @@ def test_it_does_not_engage_while_the_robot_moves_or_lies(rig, name):
     assert r.person.starts == [r.loop.state.time]
 
 
+@pytest.mark.slow
 @robots
 def test_a_lost_head_stops_the_robot_and_the_next_engagement_aligns_anew(rig, name):
     r = rig(name, mode="mobile")
@@ -236,6 +238,7 @@ def test_a_lost_head_stops_the_robot_and_the_next_engagement_aligns_anew(rig, na
     assert len(r.person.starts) == 1  # a recording is not rewound
 
 
+@pytest.mark.slow
 def test_who_lets_go_though_seen_stops_the_robot_and_takes_it_up_anew(rig):
     r = rig("rby1", mode="mobile")
     start = r.loop.state.time
@@ -254,6 +257,7 @@ def test_who_lets_go_though_seen_stops_the_robot_and_takes_it_up_anew(rig):
     assert_no_step(r, driven + let_go + again)
 
 
+@pytest.mark.slow
 def test_a_lost_hand_does_not_end_the_engagement(rig):
     r = rig("rby1")
     r.run(0.2)
@@ -342,6 +346,7 @@ def test_reset_starts_over(rig, name):
 # -- mode ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_double_pinch_toggles_the_mode(rig):
     r = rig("rby1")
     start = r.loop.state.time
@@ -377,6 +382,7 @@ def test_a_change_of_mode_is_planned_for_at_once(rig):
 # -- following -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @robots
 def test_the_robot_follows_head_and_hands(rig, name):
     """The person leans down by 6 cm of the robot's and moves the hands."""
@@ -443,6 +449,7 @@ def test_a_walking_goal_has_a_velocity(rig):
 # -- plans ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fps, control_hz, every", [(25, 25.0, 1), (50, 25.0, 2), (50, 10.0, 5), (10, 25.0, 1)]
 )
@@ -494,6 +501,7 @@ def walk_and_squat(r: Rig) -> Callable[[float], OperatorFrame]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("type_", ["mpc", "direct"])
 @robots
 def test_same_seed_same_episode(rig, name, type_):
@@ -507,6 +515,7 @@ def test_same_seed_same_episode(rig, name, type_):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_episode(rig):
     ends = []
     for seed in (0, 1):

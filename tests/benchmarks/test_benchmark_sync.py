@@ -7,6 +7,8 @@ import pytest
 
 from benchmarks import run_sync as benchmark
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("case", ["g1 stands", "rby1 drives"])
 def test_synchronised_states_predict_better_than_raw_ones(case, capsys):

@@ -108,6 +108,7 @@ def test_world_alignment_changes_nothing():
     assert not alignment.is_engaged
 
 
+@pytest.mark.slow
 def test_a_run_is_deterministic_and_measures_the_truth(short):
     track, first = run_scenario(short, 3)
     _, again = run_scenario(short, 3)
@@ -125,6 +126,7 @@ def test_a_run_is_deterministic_and_measures_the_truth(short):
     assert not first.fallen.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     ["default", "table1_equal", "table1_hold", "no_extrapolation", "no_proposal", "no_candidates",
@@ -291,6 +293,7 @@ def all_runs() -> dict:
     )
 
 
+@pytest.mark.slow
 def test_every_table_and_picture_of_the_document_can_be_filled_and_parses(tmp_path):
     pytest.importorskip("matplotlib")
     runs = all_runs()
@@ -347,6 +350,7 @@ def test_scenario_tables_take_the_longest_hold_and_variants_their_own():
     assert [row["final [cm]"] for row in rows] == ["10 / 10", "10 / 10"]
 
 
+@pytest.mark.slow
 def test_runs_with_other_settings_are_left_out(tmp_path):
     pytest.importorskip("matplotlib")
     key, run = make_run()
@@ -411,6 +415,7 @@ def test_the_script_names_what_it_does_not_know(monkeypatch, capsys):
         assert text in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_script_draws_a_run(short, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
     picture = tmp_path / "run.png"
@@ -421,6 +426,7 @@ def test_the_script_draws_a_run(short, tmp_path, monkeypatch, capsys):
     assert "rby1/short/default/0: at 1.5 s [cm]" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_runs_of_one(tmp_path, monkeypatch):
     flags = ["--robot", "rby1", "--scenarios", "quarter", "--hold", "0", "--seeds", "2"]
     flags += ["--set", "horizon=1", "--set", "num_samples=2"]

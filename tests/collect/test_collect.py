@@ -105,6 +105,7 @@ def assert_same_content(root: Path, other: Path) -> None:
 # Content.
 
 
+@pytest.mark.slow
 def test_dataset_loads_and_says_what_succeeded(serial):
     dataset = load(serial)
     assert (dataset.num_episodes, dataset.fps) == (5, 25)
@@ -123,6 +124,7 @@ def test_dataset_loads_and_says_what_succeeded(serial):
     assert not list(serial.parent.glob("*.collecting"))
 
 
+@pytest.mark.slow
 def test_format_is_that_of_a_recorded_dataset(serial, tmp_path):
     """`xop-record` with the same robot, task and device writes the same, row by row."""
     recorded = tmp_path / "recorded"
@@ -190,6 +192,7 @@ def test_operator_columns_play_again(serial):
         assert frame.left_wrist == pytest.approx(rows["operator.left_wrist"].iloc[index], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_parallel_is_serial(serial, tmp_path):
     result = collect(CONFIG, tmp_path / "data", 5, "local/toy", workers=3)
     assert result.frames == len(read_content(serial))
@@ -197,6 +200,7 @@ def test_parallel_is_serial(serial, tmp_path):
     assert_same_content(serial, tmp_path / "data")
 
 
+@pytest.mark.slow
 def test_more_episodes_are_added(serial, tmp_path):
     root = tmp_path / "data"
     first = collect(CONFIG, root, 2, workers=1)
@@ -213,6 +217,7 @@ def test_more_episodes_are_added(serial, tmp_path):
     assert before == {path: path.stat().st_mtime_ns for path in root.rglob("*")}
 
 
+@pytest.mark.slow
 def test_only_successful(serial, tmp_path):
     root = tmp_path / "data"
     config = dataclasses.replace(CONFIG, only_successful=True, video=False)
@@ -255,6 +260,7 @@ def is_alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_kill_and_go_on(serial, orders, tmp_path, monkeypatch):
     """Killed with episodes finished and under way: none is lost, and none is made twice."""
     root = tmp_path / "data"
@@ -309,6 +315,7 @@ def test_sigterm_ends_in_one_line(orders, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced(serial, orders, tmp_path, capsys):
     (orders / "die-1").touch()
     collect(CONFIG, tmp_path / "data", 2, workers=1)
@@ -384,6 +391,7 @@ class Fuse:
         return run
 
 
+@pytest.mark.slow
 def test_cut_at_any_file_of_the_exchange(serial, tmp_path, monkeypatch):
     """Whatever rename or deletion is the last before a kill, the next run ends with the same."""
     config = CONFIG

@@ -79,6 +79,7 @@ def test_the_outermost_error_is_told():
     assert find_mistake(None) is None
 
 
+@pytest.mark.slow
 def test_a_robot_in_a_command_reports(tmp_path):
     program = tmp_path / "lerobot-try"
     program.write_text(

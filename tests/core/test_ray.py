@@ -19,6 +19,8 @@ from xop_lerobot.core.versions import read_versions
 from xop_lerobot.curate.cli import main as curate
 from xop_lerobot.recording.facts import read_facts
 
+pytestmark = pytest.mark.slow
+
 REPO = Path(__file__).parents[2]
 SETTINGS = (
     "--method=direct", "--plugins=collect_toy", "--cameras=head", "--width=64", "--height=48",

@@ -59,6 +59,7 @@ def damaged(packed, tmp_path) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_whole_videos_are_whole(packed):
     video = find_video(packed)
     index = index_video(packed, video.relative_to(packed))

@@ -152,6 +152,7 @@ def test_monstrous_expressions_are_refused():
         Expression("1" * 2001, KINDS)
 
 
+@pytest.mark.slow
 @given(st.text(max_size=60))
 @settings(max_examples=300, deadline=None)
 def test_any_text_is_an_expression_or_a_clear_error(text):

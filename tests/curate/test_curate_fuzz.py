@@ -26,6 +26,8 @@ from xop_lerobot.curate.source import Source
 from xop_lerobot.curate.survey import survey
 from xop_lerobot.recording.facts import CONFIG_FILE, EPISODES_FILE
 
+pytestmark = pytest.mark.slow
+
 EPISODES, FRAMES = 3, 30
 FLAGS: dict[str, list[list[str]]] = {
     "inspect": [[]],

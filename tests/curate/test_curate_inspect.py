@@ -276,6 +276,7 @@ def test_unknown_figure_is_refused(made, capsys):
     assert "--show must name figures" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_reader_that_has_seen_enough(made):
     command = f"{sys.executable} -m xop_lerobot.curate.cli inspect --root {made} | head -1"
     done = subprocess.run(command, shell=True, cwd=REPO, capture_output=True, text=True)
@@ -286,6 +287,7 @@ def test_reader_that_has_seen_enough(made):
 # The command.
 
 
+@pytest.mark.slow
 def test_help_lists_verbs_and_loads_nothing_heavy():
     code = (
         "import sys; from xop_lerobot.curate.cli import main\n"
@@ -457,6 +459,7 @@ def test_arrays_have_two_dimensions_and_the_dtypes_of_the_file(made):
     }
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_dataset(tmp_path):
     """Peak memory of a process that inspects 5 and 60 episodes of 2,000 frames."""
     peaks = []
@@ -505,6 +508,7 @@ def interrupt_at(count: int):
     return evaluate
 
 
+@pytest.mark.slow
 def test_kill_leaves_the_source_and_the_next_run_goes_through(data):
     before = compute_digests(data)
     where = "duration > 0 and episode != 1"

@@ -19,6 +19,8 @@ from xop_lerobot.curate.cli import main
 from xop_lerobot.curate.source import Source
 from xop_lerobot.recording.facts import read_facts
 
+pytestmark = pytest.mark.slow
+
 LENGTHS = (16, 12, 14)
 HEAD = "observation.images.head"
 

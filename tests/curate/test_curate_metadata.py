@@ -97,6 +97,7 @@ CELLS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cell", "one_file"),
     [*((cell, True) for cell in CELLS), ("both", False), ("file of a video", False)],
@@ -280,6 +281,7 @@ COUNTERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COUNTERS)
 def test_rows_that_are_counted_in_their_own_way(packed, tmp_path, capsys, name):
     change, text = COUNTERS[name]
@@ -366,6 +368,7 @@ def test_empty_episode_stops_verbs_that_mend_nothing(hollow, tmp_path, capsys, v
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_empty_episode_is_left_out(hollow, tmp_path, capsys):
     out, mended = tmp_path / "out", tmp_path / "mended"
     assert curate(capsys, "filter", "--root", hollow, "--out", out, "--where", "readable")[0] == 0

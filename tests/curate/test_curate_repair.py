@@ -96,6 +96,7 @@ def killed(tmp_path_factory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_killed_session_of_lerobot(killed, whole, tmp_path, capsys, monkeypatch):
     # LeRobot looks for what it cannot read on the hub.
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
@@ -178,6 +179,7 @@ def test_an_episode_in_the_middle(whole, tmp_path, capsys):
     assert "episode 1 is lost: it has 24 of 25 rows\n" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", [Path.unlink, lambda path: path.write_bytes(b"no parquet")])
 @pytest.mark.parametrize("name", [META, "meta/stats.json"])
 def test_metadata_is_made_anew(whole, tmp_path, spoil, name):
@@ -267,6 +269,7 @@ def parquet(tmp_path_factory):
     return path, tables, ends
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["footer", "exactly", "a byte short", "first", "middle"])
 def test_row_groups_that_are_whole_come_back(parquet, tmp_path, where):
     path, tables, ends = parquet
@@ -345,6 +348,7 @@ VALUES = st.deferred(
 STRUCTS = st.dictionaries(st.integers(1, 200), VALUES, max_size=4)
 
 
+@pytest.mark.slow
 @given(STRUCTS)
 @settings(max_examples=200, deadline=None)
 def test_thrift_round_trip(fields):

@@ -94,6 +94,7 @@ def read_column(page, name: str) -> list[str]:
     return cells.all_inner_texts()
 
 
+@pytest.mark.slow
 def test_the_page_runs_and_fetches_nothing(page, page_file):
     assert page.title() == "Dataset data"
     page.locator("#episode-5").scroll_into_view_if_needed()
@@ -102,6 +103,7 @@ def test_the_page_runs_and_fetches_nothing(page, page_file):
     assert page.requests == [page_file.as_uri()]
 
 
+@pytest.mark.slow
 def test_the_table_sorts_by_any_figure(page, page_file):
     assert read_column(page, "episode") == [str(index) for index in range(EPISODES)]
     data = read_figures(page_file)
@@ -300,6 +302,7 @@ def test_what_cannot_be_read_is_named_and_the_rest_is_shown(foreign, tmp_path, c
     assert [len(each["groups"]) for each in read_timelines(path)] == [1, 1]
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_dataset(made, tmp_path):
     """What is held after many episodes is what is held after few."""
 

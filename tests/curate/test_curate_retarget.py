@@ -38,6 +38,8 @@ from xop_lerobot.operator.recording import Recording, load_recording, make_recor
 from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.retarget.config import RetargeterConfig
 
+pytestmark = pytest.mark.slow
+
 REPO = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("XOP_SHARED", REPO.parent / "shared"))
 HUMAN = SHARED / "operator" / "human_seq_0_0.npz"
@@ -440,9 +442,6 @@ def test_choices():
 
 
 # Real robots and a real person.
-
-
-@pytest.mark.slow
 def test_a_session_of_g1_becomes_one_of_rby1(tmp_path):
     if not HUMAN.exists():
         pytest.skip(f"the recording of a person, {HUMAN}, is not on this machine")

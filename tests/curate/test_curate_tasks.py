@@ -75,6 +75,7 @@ def test_words_are_found_wherever_they_are(data, kind):
     assert has_index_of_words(data) == (kind == "an index without a name")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", VERBS)
 @pytest.mark.parametrize("kind", ["a column", "an index without a name"])
 def test_every_verb_keeps_them(data, tmp_path, verb, kind):

@@ -76,6 +76,7 @@ def check_same(root, out, spans, fps, key):
 SPANS = [(0, None), (1, (7, 20)), (2, (1, 36))]
 
 
+@pytest.mark.slow
 def test_rows_and_pictures_are_the_same(recorded, tmp_path):
     before = compute_digests(recorded)
     done = copy_clips(recorded, tmp_path / "out", SPANS)
@@ -84,6 +85,7 @@ def test_rows_and_pictures_are_the_same(recorded, tmp_path):
     assert compute_digests(recorded) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "encoder",
     [
@@ -133,6 +135,7 @@ def test_twice_the_same(recorded, tmp_path):
     assert compute_digests(tmp_path / "one") == compute_digests(tmp_path / "two")
 
 
+@pytest.mark.slow
 def test_agrees_with_lerobot(recorded, tmp_path):
     """LeRobot's delete and merge, where they keep what they know, give the same."""
     copy_clips(recorded, tmp_path / "ours", [(0, None), (2, None)])
@@ -232,6 +235,7 @@ def test_changes_are_cut_along():
     ]
 
 
+@pytest.mark.slow
 def test_new_columns_and_another_task(recorded, tmp_path):
     with Source(recorded) as source:
         entry = next(source.episodes)
@@ -247,6 +251,7 @@ def test_new_columns_and_another_task(recorded, tmp_path):
     assert dataset.meta.stats["extra"]["max"] == [entry.length - 1]
 
 
+@pytest.mark.slow
 def test_pictures_in_the_rows(tmp_path):
     root = record_toy(tmp_path / "png", (12, 14), session="png", video=False)
     copy_clips(root, tmp_path / "out", [(1, (3, 9))])
@@ -257,6 +262,7 @@ def test_pictures_in_the_rows(tmp_path):
     assert new.meta.stats[HEAD]["count"] == [6]
 
 
+@pytest.mark.slow
 def test_recording_goes_on_in_it(recorded, tmp_path):
     """`--resume` adds to a curated dataset, and LeRobot loads both parts."""
     out = tmp_path / "out"
@@ -325,6 +331,7 @@ def test_missing_pictures_are_counted():
 # Merge and split.
 
 
+@pytest.mark.slow
 def test_merge(recorded, tmp_path, capsys):
     copy_clips(recorded, tmp_path / "part", [(2, (0, 10))])
     out = tmp_path / "out"

@@ -70,6 +70,7 @@ def trim(root, out, *flags) -> dict[int, tuple[int, int]]:
     }
 
 
+@pytest.mark.slow
 def test_idle_ends_are_cut(base, tmp_path, capsys):
     before = compute_digests(base)
     spans = trim(base, tmp_path / "out", "--margin", "0.4")
@@ -87,6 +88,7 @@ def test_idle_ends_are_cut(base, tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_rows_and_pictures_stay_together(base, tmp_path):
     """Row and picture i of the new episode are row and picture start + i of the old one."""
     out = tmp_path / "out"

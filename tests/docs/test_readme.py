@@ -105,6 +105,7 @@ def check_curate(words: list[str]) -> None:
         Expression(parsed.where, KINDS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "command"), ALL_COMMANDS)
 def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     if command[0] == "make":

@@ -422,6 +422,7 @@ def read_parallel() -> list[str]:
     return flags.split()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", [read_parallel(), [], ["-p", "no:xdist"]], ids=" ".join)
 def test_what_is_skipped_is_told_at_the_end_with_its_reason(
     tmp_path: Path, flags: list[str]

@@ -34,6 +34,8 @@ from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.recording.record import build_features
 from xop_lerobot.session import get_session
 
+pytestmark = pytest.mark.slow
+
 REPO = Path(__file__).parents[2]
 CONFIG = REPO / "configs" / "train_act_rby1_reach.yaml"
 WIDTH, HEIGHT = 32, 24
@@ -116,7 +118,6 @@ def policy(collected, tmp_path_factory) -> Path:
     return out / "checkpoints" / "last" / "pretrained_model"
 
 
-@pytest.mark.slow
 def test_a_trained_policy_has_these_inputs_and_outputs(policy):
     config = PreTrainedConfig.from_pretrained(policy)
     assert config.input_features is not None
@@ -131,7 +132,6 @@ def test_a_trained_policy_has_these_inputs_and_outputs(policy):
     }
 
 
-@pytest.mark.slow
 def test_nothing_but_its_inputs_changes_what_it_does(policy, collected):
     """Every other column of a row may hold anything, and a changed input is noticed."""
     config = PreTrainedConfig.from_pretrained(policy)
@@ -154,7 +154,6 @@ def test_nothing_but_its_inputs_changes_what_it_does(policy, collected):
         assert not torch.equal(predict({**row, key: row[key] * 0.5 + 0.1}), before), key
 
 
-@pytest.mark.slow
 def test_it_drives_the_robot_and_is_evaluated(policy, tmp_path, monkeypatch):
     """`lerobot-rollout` twice with the same seed, then the script that compares them."""
     for name in ("one", "two"):

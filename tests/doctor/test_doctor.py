@@ -213,6 +213,7 @@ def test_a_headset_that_streams():
     assert found.figures["delay_ms"] is None
 
 
+@pytest.mark.slow
 def test_a_slow_stream_and_a_lost_hand():
     slow = measure(rate=8)
     assert slow.level is Level.FAIL
@@ -231,6 +232,7 @@ def test_hands_that_are_shown_too_seldom():
     assert 3 < found.figures["hand_rates_hz"]["left"] < 12.5
 
 
+@pytest.mark.slow
 def test_an_app_that_refuses_this_version():
     server, over = AvpServer(), threading.Event()
 

@@ -101,6 +101,7 @@ def test_a_key_tells_every_setting():
                                                 .resolved, 1)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_study_goes_on_after_a_crash_and_after_a_line_cut_off(tmp_path):
     cell, results = Cell(SETUP, 3), Results(tmp_path / "out")
     outcomes = list(run_study([cell], results, 1, run=run_made))
@@ -159,6 +160,7 @@ def test_methods_and_variants():
         resolve_low_level(rby1, "mpc", "falcon")
 
 
+@pytest.mark.slow
 def test_every_cell_of_the_papers_tables_can_be_made(tmp_path):
     cells = load_study(_repository() / "configs" / "paper_tables.yaml", {"trials": 2, "seed": 7})
     assert {(cell.setup.robot, cell.setup.task) for cell in cells} == {
@@ -265,6 +267,7 @@ def test_the_page_is_whole_and_tells_whose_figures_are_whose(tmp_path):
     assert [row["success"] for row in rows] == [3, 2, 0]
 
 
+@pytest.mark.slow
 def test_a_whole_study_can_be_narrowed(tmp_path, capsys):
     path = str(_repository() / "configs" / "paper_tables.yaml")
     out = ["--out", str(tmp_path), "--no-run"]

@@ -27,6 +27,7 @@ def trial():
     return run_trial(DIRECT, seed=3)
 
 
+@pytest.mark.slow
 def test_the_same_seed_is_the_same_trial(trial):
     again, other = run_trial(DIRECT, seed=3), run_trial(DIRECT, seed=4)
     np.testing.assert_array_equal(again.trace.qpos, trial.trace.qpos)

@@ -279,6 +279,7 @@ def test_g1_bears_a_load() -> None:
     simulation.close()
 
 
+@pytest.mark.slow
 def test_g1_stops_in_any_phase_of_its_gait() -> None:
     """From 1 m/s, with the arms held ahead as operators do: no fall, hardly a way back."""
     n, policy = 16, make_policy("default")
@@ -631,6 +632,7 @@ def test_wrong_shape_or_format(tmp_path: Path) -> None:
         make_policy("falcon", str(text.rename(tmp_path / "text.txt")))
 
 
+@pytest.mark.slow
 def test_distillation_runs_from_a_teacher_file(tmp_path: Path) -> None:
     """The script makes loadable weights."""
     out = tmp_path / "student.npz"
@@ -644,6 +646,7 @@ def test_distillation_runs_from_a_teacher_file(tmp_path: Path) -> None:
     assert [w.shape for w in weights] == [(575, 541), (541, 285), (285, 29)]
 
 
+@pytest.mark.slow
 def test_benchmark_of_policies_writes_a_table(tmp_path: Path) -> None:
     """Policies side by side; what the file of results holds is not run again."""
     page, results = tmp_path / "page.md", tmp_path / "results.json"

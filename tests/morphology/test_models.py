@@ -202,6 +202,7 @@ class TestContract:
         assert model.vis.quality.offsamples == 0
         assert model.vis.global_.offwidth >= 640 and model.vis.global_.offheight >= 480
 
+    @pytest.mark.slow
     def test_cameras_see_something(self, robot: str) -> None:
         model, data = standing(robot, "full", "tabletop")
         with mujoco.Renderer(model, 240, 320) as renderer:

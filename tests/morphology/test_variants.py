@@ -29,6 +29,8 @@ from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.plan import Plan
 from xop_lerobot.retarget.presets import build_configs
 
+pytestmark = pytest.mark.slow
+
 DT = 0.04
 
 

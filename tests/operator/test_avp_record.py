@@ -28,6 +28,8 @@ from xop_lerobot.operator.recording import Recording, load_recording
 from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.session import get_session
 
+pytestmark = pytest.mark.slow
+
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[3] / "shared"))
 RATE = 60
 PATIENCE_S = 240.0
@@ -111,7 +113,6 @@ def is_engaged() -> bool:
     return tick is not None and tick.engaged
 
 
-@pytest.mark.slow
 def test_lerobot_record_of_a_g1_in_real_time(tmp_path, monkeypatch):
     files = sorted((SHARED / "operator").glob("*.npz"))
     if not files:

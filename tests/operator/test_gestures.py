@@ -49,6 +49,7 @@ def run(
 DOUBLE = [(1.0, 1.12), (1.3, 1.42)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", RATES)
 @settings(max_examples=15, deadline=None)
 @given(shift=st.floats(0, 0.039))
@@ -129,6 +130,7 @@ def test_a_clock_that_goes_back_starts_anew() -> None:
         assert toggles == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [25, 50])
 @pytest.mark.parametrize("script", ["g1_squat_walk_reach", "rby1_drive_reach"])
 @pytest.mark.parametrize("seed", [0, 1, 2])

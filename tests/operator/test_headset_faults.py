@@ -20,6 +20,8 @@ from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.engagement import Clutch, Wish
 from xop_lerobot.operator.frame import OperatorFrame
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def make_rig() -> Iterator[Callable[[str], Rig]]:
@@ -115,7 +117,6 @@ def make_stopping() -> dict[str, Fault]:
     }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", list(POLICIES))
 def test_faults_that_pass(make_rig, name):
     rig = make_rig(name)
@@ -127,7 +128,6 @@ def test_faults_that_pass(make_rig, name):
     rig.check()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", list(POLICIES))
 def test_faults_that_stop(make_rig, name):
     rig = make_rig(name)
@@ -151,7 +151,6 @@ def test_faults_that_stop(make_rig, name):
     rig.check()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", list(POLICIES))
 def test_a_lost_hand_freezes_its_arm_alone(make_rig, name):
     rig = make_rig(name)
@@ -164,7 +163,6 @@ def test_a_lost_hand_freezes_its_arm_alone(make_rig, name):
     rig.check()
 
 
-@pytest.mark.slow
 def test_let_go_by_the_gesture_and_replay(make_rig):
     """The frames of the ticks, as they are recorded, replay to the same engagements."""
     rig = make_rig("rby1")

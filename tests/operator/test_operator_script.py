@@ -76,6 +76,7 @@ def test_waypoints_are_passed_at_rest_and_left_out_parts_stay() -> None:
         assert np.abs(speed).max() < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["g1_squat_walk_reach", "rby1_drive_reach"])
 def test_shipped_scripts_move_like_a_calm_person(name: str) -> None:
     assert name in list_scripts()
@@ -100,6 +101,7 @@ def test_g1_script_squats_walks_turns_and_reaches() -> None:
     assert np.arctan2(forward[1], forward[0]) == pytest.approx(0.5, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_same_seed_same_stream_another_seed_another() -> None:
     first, again, other = (play("rby1_drive_reach", seed) for seed in (7, 7, 8))
     for name in FRAMES:

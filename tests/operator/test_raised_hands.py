@@ -100,6 +100,7 @@ GESTURES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [25, 30, 50, 90, 120])
 @pytest.mark.parametrize("wish", list(GESTURES))
 def test_a_raised_hand_that_pinches_asks_once(wish, rate):
@@ -146,6 +147,7 @@ def test_what_asks_nothing(what):
     assert find_wishes(NOTHING[what]()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(ORIENTATIONS))
 def test_other_hands_ask_nothing(name):
     for raised, pinched, _ in GESTURES.values():
@@ -272,6 +274,7 @@ def work(frames: Iterable[OperatorFrame], rng: np.random.Generator) -> Iterable[
         yield dataclasses.replace(frame, pinch=np.where(closed, 0.008, 0.07))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_person_who_works_asks_nothing(seed):
     """Who stands, walks, turns, reaches and grasps for 5 minutes, palms inwards."""
@@ -280,6 +283,7 @@ def test_a_person_who_works_asks_nothing(seed):
     assert read(frames)[1:] == ([], [])
 
 
+@pytest.mark.slow
 def test_real_motion_asks_nothing_whatever_the_pinches_do():
     files = sorted((SHARED / "operator").glob("*.npz"))
     if not files:

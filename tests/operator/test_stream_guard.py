@@ -163,6 +163,7 @@ def turn_space(frame: OperatorFrame, yaw: float, place=(0.0, 0.0, 0.0)) -> Opera
     return dataclasses.replace(frame, **poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [(), (1,), (1, 2)])
 @pytest.mark.parametrize("degrees", [-150, -40, -25, 20, 90])
 @pytest.mark.parametrize("rate", [50, 72, 90])
@@ -194,6 +195,7 @@ def test_hands_that_go_along_tell_a_small_recentring(rate, degrees):
     assert guard.relocations == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "stream", "seconds"),
     [

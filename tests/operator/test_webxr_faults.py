@@ -22,6 +22,8 @@ from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.engagement import UNSEEN
 from xop_lerobot.operator.frame import OperatorFrame
 
+pytestmark = pytest.mark.slow
+
 Fault = Callable[[float, OperatorFrame], list[OperatorFrame | str]]
 HEAD_LOST = np.array([False, True, True])
 LATE = (
@@ -160,7 +162,6 @@ def make_stopping() -> dict[str, tuple[Fault, str]]:
     }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rby1", "g1"])
 def test_faults_that_pass(make_rig, name):
     rig = make_rig(name)
@@ -178,7 +179,6 @@ def test_faults_that_pass(make_rig, name):
     assert counts["from_the_future"] == 30 and counts["head_not_finite"] == 30
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rby1", "g1"])
 def test_faults_that_stop(make_rig, name):
     rig = make_rig(name)
@@ -200,7 +200,6 @@ def test_faults_that_stop(make_rig, name):
     rig.check()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rby1", "g1"])
 def test_a_lost_hand_freezes_its_arm_alone(make_rig, name):
     rig = make_rig(name)
@@ -221,7 +220,6 @@ def test_a_lost_hand_freezes_its_arm_alone(make_rig, name):
     rig.check()
 
 
-@pytest.mark.slow
 def test_a_hand_that_comes_and_goes_is_followed(make_rig):
     """At the edge of the view: 45 ms in each quarter of a second it is not seen."""
     rig = make_rig("rby1")
@@ -244,7 +242,6 @@ def test_a_hand_that_comes_and_goes_is_followed(make_rig):
     rig.check()
 
 
-@pytest.mark.slow
 def test_a_constant_delay(make_rig):
     """500 ms: nobody engages, and it is told why; who allows it drives, and is warned."""
     delayed = lambda t, f: [dataclasses.replace(f, time=f.time - 0.5)]  # noqa: E731
@@ -268,7 +265,6 @@ def test_a_constant_delay(make_rig):
     rig.check()
 
 
-@pytest.mark.slow
 def test_connections_that_end(make_rig):
     """The headset is taken off, the page is loaded anew, a message is too long, the net is cut."""
     rig = make_rig("rby1")
@@ -312,7 +308,6 @@ def test_connections_that_end(make_rig):
     rig.check()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [4, 25, 120])
 def test_a_headset_that_is_recentred_lets_go_and_turns_no_robot(make_rig, degrees):
     rig = make_rig("rby1")
@@ -329,7 +324,6 @@ def test_a_headset_that_is_recentred_lets_go_and_turns_no_robot(make_rig, degree
     rig.check()
 
 
-@pytest.mark.slow
 def test_a_second_client_changes_nothing(make_rig):
     rig = make_rig("rby1")
     rig.engage()

@@ -326,6 +326,7 @@ def test_tls(tmp_path, monkeypatch):
         device.disconnect()
 
 
+@pytest.mark.slow
 def test_a_browser_trusts_it_once_it_is_installed(tmp_path, monkeypatch):
     """As a headset's: refused at first; after /cert was installed the page is secure and drives."""
     certutil = shutil.which("certutil")

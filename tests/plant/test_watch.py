@@ -140,6 +140,7 @@ def test_a_servo_that_is_late_for_a_moment_does_not_give_way():
         assert walk.run(0.28) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["off", "mild"])
 @robots
 def test_robots_that_stand_squat_lean_and_stop_are_in_no_trouble(name, noise):
@@ -163,6 +164,7 @@ def test_robots_that_stand_squat_lean_and_stop_are_in_no_trouble(name, noise):
     loop.close()
 
 
+@pytest.mark.slow
 @robots
 def test_the_operator_is_told_and_the_arms_go_back_to_rest(name, monkeypatch):
     """Whoever drives is let go, and drives again once the robot stands."""

@@ -195,6 +195,7 @@ def test_no_column_is_ever_nan(session, pair):
 # Recording.
 
 
+@pytest.mark.slow
 def test_round_trip(session, pair, tmp_path):
     robot, teleop = pair
     root = tmp_path / "data"
@@ -232,6 +233,7 @@ def test_round_trip(session, pair, tmp_path):
     assert np.diff(stack(first, "time.sim")[:, 0]) == pytest.approx(1 / 25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_videos", [True, False])
 def test_tables_are_what_lerobot_writes(session, pair, tmp_path, monkeypatch, use_videos):
     """Leaving out the pass that embeds image files changes nothing, and it stays where needed."""
@@ -256,6 +258,7 @@ def test_tables_are_what_lerobot_writes(session, pair, tmp_path, monkeypatch, us
         assert ours[key].to_pylist() == stock[key].to_pylist(), key
 
 
+@pytest.mark.slow
 def test_facts_of_an_episode(session, pair, tmp_path):
     robot, teleop = pair
     dataset = create(session, robot, tmp_path / "data")
@@ -383,6 +386,7 @@ def test_clearing_starts_the_episode_over(session, pair, tmp_path):
     assert not np.array_equal(get_state(robot).qpos, qpos)
 
 
+@pytest.mark.slow
 def test_resume(session, pair, tmp_path):
     robot, teleop = pair
     root = tmp_path / "data"
@@ -539,6 +543,7 @@ def test_an_encoder_that_changed_is_reported(caplog):
     queue.wait()
 
 
+@pytest.mark.slow
 def test_lockstep_loses_no_frame_to_a_slow_encoder(session, pair, tmp_path, monkeypatch):
     robot, teleop = pair
     dataset = create(session, robot, tmp_path / "data", **STREAMING)
@@ -578,6 +583,7 @@ def test_an_episode_with_lost_frames_is_marked_in_real_time(session, pair, tmp_p
 # Durability.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotates", [True, False])
 def test_saved_episodes_load_while_the_session_goes_on(
     session, pair, tmp_path, monkeypatch, rotates
@@ -669,6 +675,7 @@ def test_a_killed_session_keeps_its_episodes(tmp_path, command, number):
 # Settings and changes.
 
 
+@pytest.mark.slow
 def test_changes_are_recorded_with_their_frame(session, tmp_path):
     robot, teleop = make_toy(session), make_teleop(session, retargeter="mpc")
     teleop.connect()
@@ -726,6 +733,7 @@ def test_a_discarded_episode_takes_its_changes_along(session, pair, tmp_path):
     assert facts["changes"] == []
 
 
+@pytest.mark.slow
 def test_columns_of_another_version_are_not_mixed(session, pair, tmp_path, monkeypatch):
     robot, teleop = pair
     root = tmp_path / "data"

@@ -130,6 +130,7 @@ def run_xop(session, root, teleop=None, **dataset):
     return record(robot, teleop or make_teleop(session).config, root, **dataset)
 
 
+@pytest.mark.slow
 def test_lerobot_records_lockstep_episodes_of_exact_length(session, tmp_path, monkeypatch):
     """However slow the machine: here LeRobot sees a clock that runs a thousand times as fast."""
     ticks = iter(range(10**9))
@@ -143,6 +144,7 @@ def test_lerobot_records_lockstep_episodes_of_exact_length(session, tmp_path, mo
     assert [row["length"] for row in read_facts(tmp_path / "data")] == [10, 10]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_dataset(session, tmp_path):
     tables = []
     for name in ("first", "second"):
@@ -384,6 +386,7 @@ def test_lockstep_takes_no_actions_between_the_policys(session, recording):
 # Keys that are pressed again while an episode is saved.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["right", "left"])
 def test_a_key_that_is_pressed_again_is_not_for_the_next_episode(recording, key):
     """The second press comes while the first episode is saved, the third while the robot resets."""

@@ -30,6 +30,8 @@ from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.recording.record import XopRecordConfig
 from xop_lerobot.session import get_session
 
+pytestmark = pytest.mark.slow
+
 REPO = Path(__file__).parents[2]
 ROBOT = ("--robot.type=xop_toy", "--robot.width=64", "--robot.height=48")
 TELEOP = (
@@ -71,7 +73,6 @@ def recorded(tmp_path_factory) -> Path:
     return root
 
 
-@pytest.mark.slow
 def test_lerobot_record(recorded):
     dataset = LeRobotDataset("local/toy", root=recorded)
     assert (dataset.num_episodes, len(dataset)) == (2, 20)
@@ -79,7 +80,6 @@ def test_lerobot_record(recorded):
     assert dataset.meta.robot_type == "xop_toy"
 
 
-@pytest.mark.slow
 def test_xop_record_writes_the_same(recorded, tmp_path, monkeypatch):
     root = tmp_path / "data"
     run(monkeypatch, "xop-record", *ROBOT, *TELEOP, *record_flags(root), "--play_sounds=false")
@@ -92,7 +92,6 @@ def test_xop_record_writes_the_same(recorded, tmp_path, monkeypatch):
         assert np.array_equal(first, second), key
 
 
-@pytest.mark.slow
 def test_resuming_from_the_command_line(recorded, tmp_path, monkeypatch):
     root = tmp_path / "data"
     flags = [*ROBOT, *TELEOP, *record_flags(root, num_episodes=1), "--play_sounds=false"]
@@ -102,7 +101,6 @@ def test_resuming_from_the_command_line(recorded, tmp_path, monkeypatch):
     assert LeRobotDataset("local/toy", root=root).num_episodes == 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", ["lerobot-record", "xop-record"])
 def test_a_key_pressed_twice(tmp_path, monkeypatch, command):
     """The second press comes while the episode is saved; the session goes on with whole ones."""
@@ -121,7 +119,6 @@ def test_a_key_pressed_twice(tmp_path, monkeypatch, command):
     assert [row["length"] for row in read_facts(root)] == [10, 10, 10]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", ["lerobot-record", "xop-record"])
 def test_real_time(tmp_path, monkeypatch, command):
     """On the wall clock an episode ends by the wall clock, and says how it went."""
@@ -142,12 +139,10 @@ def test_real_time(tmp_path, monkeypatch, command):
         assert len(stamps) > 1
 
 
-@pytest.mark.slow
 def test_lerobot_teleoperate(monkeypatch):
     run(monkeypatch, "lerobot-teleoperate", *ROBOT, *TELEOP, "--fps=50", "--teleop_time_s=1")
 
 
-@pytest.mark.slow
 def test_lerobot_replay(recorded, monkeypatch):
     sent = []
     execute = toy_robot.XopToy.send_action
@@ -181,7 +176,6 @@ def policy(recorded, tmp_path_factory) -> Path:
     return out / "checkpoints" / "last" / "pretrained_model"
 
 
-@pytest.mark.slow
 def test_lerobot_train_takes_state_and_pictures(policy):
     from lerobot.configs import PreTrainedConfig
 
@@ -192,7 +186,6 @@ def test_lerobot_train_takes_state_and_pictures(policy):
     assert set(config.output_features) == {"action"}
 
 
-@pytest.mark.slow
 def test_lerobot_rollout(policy, tmp_path, monkeypatch):
     root = tmp_path / "data"
     executed, execute = [], toy_robot.XopToy.send_action
@@ -219,7 +212,6 @@ def test_lerobot_rollout(policy, tmp_path, monkeypatch):
     assert np.array_equal(np.stack(dataset.hf_dataset["action"]), actions)
 
 
-@pytest.mark.slow
 def test_a_policy_of_another_size_is_refused(policy, tmp_path, monkeypatch):
     """Before the robot is connected, and before a dataset is made."""
     monkeypatch.setattr("toy_robot.XopToy.connect", lambda *_: 1 / 0)
@@ -299,9 +291,6 @@ def test_configs_that_are_shipped(robot, config_class):
 
 
 # Changed while it records.
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("command", ["lerobot-record", "xop-record"])
 def test_settings_change_while_it_records(tmp_path, monkeypatch, command):
     """Through the control socket, as another terminal does it, and into the episode."""

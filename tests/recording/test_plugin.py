@@ -59,6 +59,7 @@ def run_python(code: str, *paths: Path) -> subprocess.CompletedProcess:
 # Registration.
 
 
+@pytest.mark.slow
 def test_import_is_light():
     """What the plugin itself loads, beyond what LeRobot's two configuration modules do."""
     code = f"""
@@ -348,6 +349,7 @@ def test_an_episode_starts_the_same_from_anywhere(session):
 # The teleoperator.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("retargeter", ["direct", "mpc"])
 def test_a_third_robot_is_driven(session, retargeter):
     robot, teleop = make_toy(session), make_teleop(session, retargeter)

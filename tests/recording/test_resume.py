@@ -20,6 +20,8 @@ from xop_lerobot.recording.facts import CONFIG_FILE, CONFIGS_DIR, read_facts
 from xop_lerobot.recording.record import build_features
 from xop_lerobot.recording.resume import NotResumable
 
+pytestmark = pytest.mark.slow
+
 HINT = "Record as it was recorded, or begin another --dataset.root without --resume=true"
 
 
@@ -221,7 +223,6 @@ def test_the_configuration_is_written_with_an_episode(session, recorded, tmp_pat
     assert LeRobotDataset("local/toy", root=root).num_episodes == 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", ["xop-record", "lerobot-record"])
 def test_the_commands_refuse_in_a_line(recorded, monkeypatch, command):
     """Before either device is connected."""
@@ -237,7 +238,6 @@ def test_the_commands_refuse_in_a_line(recorded, monkeypatch, command):
     assert read_files(recorded) == before
 
 
-@pytest.mark.slow
 def test_pictures_in_files_are_not_added_to_as_videos(recorded, monkeypatch, caplog):
     robot = ("--robot.type=xop_toy", "--robot.width=64", "--robot.height=48")
     flags = [*robot, *TELEOP, *record_flags(recorded, video="false", streaming_encoding="false")]

@@ -72,6 +72,7 @@ POINTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("point", "rotates"), [*((point, True) for point in POINTS), ("rows", False)]
 )
@@ -148,6 +149,7 @@ def test_what_cannot_be_taken_back_is_repaired(
     )
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_during_an_episode(
     session, pair, tmp_path, monkeypatch  # noqa: F811
 ):  # fmt: skip

@@ -88,6 +88,7 @@ def assert_within_limits(a: Arms, before: np.ndarray, after: np.ndarray, dt: flo
 # -- reaching ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @robots
 @pytest.mark.parametrize("seed", range(4))
 def test_a_reachable_goal_is_reached(arms, solvers, name, seed):

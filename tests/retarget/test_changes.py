@@ -389,6 +389,7 @@ def test_no_change_makes_a_step(person, robot, data):  # noqa: F811
     assert_smooth(r, commands, arms)
 
 
+@pytest.mark.slow
 def test_a_hand_that_drives_torso_and_arm_and_back_makes_no_step(rig):  # noqa: F811
     r = rig("rby1")
     r.person.motion = wander(r)
@@ -405,6 +406,7 @@ def test_a_hand_that_drives_torso_and_arm_and_back_makes_no_step(rig):  # noqa: 
     assert np.abs(np.diff(arms, axis=0)).max() > 0.001
 
 
+@pytest.mark.slow
 def test_a_hand_that_is_freed_from_a_constraint_turns_to_its_goal_slowly(rig):  # noqa: F811
     """From how the robot holds its hand, which the constraint kept level, within a second."""
     r = rig("rby1")
@@ -430,6 +432,7 @@ def test_a_hand_that_is_freed_from_a_constraint_turns_to_its_goal_slowly(rig):  
     np.testing.assert_allclose(goals[-1], asked, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_refused_change_changes_nothing_in_mid_motion(rig):  # noqa: F811
     ends = []
     for disturb in (False, True):
@@ -517,6 +520,7 @@ def test_the_other_hand_alone_has_a_gesture_of_its_own():
     assert gesture is Gesture.DOUBLE_PINCH
 
 
+@pytest.mark.slow
 def test_both_hands_toggle_the_constraint(rig):  # noqa: F811
     r = rig("rby1")
     begin = r.loop.state.time

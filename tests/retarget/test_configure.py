@@ -281,6 +281,7 @@ def test_without_the_observers_nothing_that_they_knew_is_left(bench):
 # -- from other threads ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_changes_from_another_thread_arrive_whole(threads):
     """Every plan is of one configuration or the other: its length, arms and frames agree."""

@@ -223,6 +223,7 @@ def driver(request):
     made.close()
 
 
+@pytest.mark.slow
 def test_the_nearer_a_wall_the_more_is_done(driver):
     """The reason and the risk are in `Plan.health`, and the velocity is what they say."""
     free = driver.plan(5.0)
@@ -249,6 +250,7 @@ def test_the_nearer_a_wall_the_more_is_done(driver):
     assert risks[-1] < 0.01
 
 
+@pytest.mark.slow
 def test_some_are_slowed_before_they_are_vetoed():
     seen = set()
     for speed in (0.3, 1.0):

@@ -158,6 +158,7 @@ def test_weights_are_a_distribution_that_prefers_the_cheaper(weighting, costs):
     assert (np.diff(weights[order]) <= 1e-12).all()
 
 
+@pytest.mark.slow
 @weightings
 @given(costs=costs_strategy, offset=st.floats(-10, 10))
 def test_a_constant_cost_changes_nothing(weighting, costs, offset):

@@ -109,6 +109,7 @@ def bench():
 # -- closed loop ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, mode, offset, yaw, seconds, distance, angle",
     [
@@ -134,6 +135,7 @@ def test_a_small_goal_is_reached(bench, name, mode, offset, yaw, seconds, distan
     assert last[about] < errors[quarter : 2 * quarter, about].mean() + 0.02
 
 
+@pytest.mark.slow
 @robots
 @modes
 def test_at_the_goal_the_robot_stays(bench, name, mode):
@@ -142,12 +144,14 @@ def test_at_the_goal_the_robot_stays(bench, name, mode):
     assert errors[:, 0].max() < (0.12 if name == "g1" else 0.03)
 
 
+@pytest.mark.slow
 def test_a_goal_out_of_reach_is_followed_as_far_as_is_safe(bench):
     b = bench("g1")
     b.drive(b.make_goal(Mode.STATIONARY, (0, 0, -0.7)), 3)
     assert 0.4 < b.loop.state.qpos[2] < 0.62
 
 
+@pytest.mark.slow
 def test_a_moving_goal_is_followed_more_closely_when_its_velocity_is_known(bench):
     lags = []
     for known in (True, False):
@@ -181,6 +185,7 @@ def walled() -> tuple[Morphology, mujoco.MjModel, float]:
     return morphology, spec.compile(), wall
 
 
+@pytest.mark.slow
 def test_a_wall_shows_in_the_cost(walled):
     """Seen, it costs more the nearer it is, and keeps the robot further away."""
     morphology, model, wall = walled
@@ -217,6 +222,7 @@ def run(b: Bench, ticks: int = 6, mode: Mode = Mode.MOBILE) -> list[np.ndarray]:
     return [b.tick(goal).commands for _ in range(ticks)]
 
 
+@pytest.mark.slow
 @robots
 @modes
 def test_same_seed_same_plans(bench, name, mode):
@@ -225,6 +231,7 @@ def test_same_seed_same_plans(bench, name, mode):
     assert (np.array(first) != np.array(other)).any()
 
 
+@pytest.mark.slow
 @robots
 @modes
 def test_threads_do_not_change_the_plan(bench, name, mode):
@@ -280,6 +287,7 @@ def test_the_plan_is_what_the_robot_then_does(bench, mode):
         np.testing.assert_allclose(b.loop.state.qpos, plan.qpos[k + 1], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @robots
 def test_stationary_plans_sway_at_most(bench, name):
     b = bench(name)
@@ -290,6 +298,7 @@ def test_stationary_plans_sway_at_most(bench, name):
     assert not b.loop.state.fallen
 
 
+@pytest.mark.slow
 @robots
 def test_a_change_of_mode_makes_no_step(bench, name):
     """Whatever is planned, the robot's command moves at its rate; and it comes to rest."""

@@ -215,6 +215,7 @@ def lean(observe: bool) -> tuple[float, float]:
     return float(np.linalg.norm(mean[:3])), float(np.linalg.norm(mean[3:]))
 
 
+@pytest.mark.slow
 def test_with_it_a_robot_has_no_steady_offset():
     without, with_it = lean(observe=False), lean(observe=True)
     assert with_it[0] < min(0.005, 0.5 * without[0])

@@ -148,6 +148,7 @@ def fleet() -> dict[str, Robot]:
     return {name: Robot(name) for name in ROBOTS}
 
 
+@pytest.mark.slow
 @robots
 def test_random_goals_are_reached_from_any_posture(fleet, name):
     """Goals that are reachable by construction, from the neutral posture and two random ones."""
@@ -184,6 +185,7 @@ def bend_and_walk(clock: float) -> np.ndarray:
     return make_pose(np.array([x, 0.0, z]), quat_from_rpy(0.0, pitch, yaw))
 
 
+@pytest.mark.slow
 def test_who_bends_quickly_and_walks_on_is_met_with_folded_knees(fleet):
     """RB-Y1 used to end with straight knees, its head 12 cm too high."""
     robot, dt, command = fleet["rby1"], 0.04, fleet["rby1"].space.neutral

@@ -12,6 +12,8 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.retarget.config import RetargeterConfig
 
+pytestmark = pytest.mark.slow
+
 STEPS = {  # where the person's head goes, and its heading
     Mode.STATIONARY: ((0.03, 0.0, -0.12), 0.4),
     Mode.MOBILE: ((0.7, 0.2, 0.0), 0.3),
@@ -56,7 +58,6 @@ def follow(robot: str, mode: Mode, preset: str) -> dict[str, float]:
     }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mode", list(Mode))
 @pytest.mark.parametrize("robot", ["g1", "rby1"])
 def test_conservative_is_smoother_and_slower_than_aggressive(robot, mode):

@@ -134,6 +134,7 @@ def compute_velocity_error(states, synced):
     return np.sqrt(np.mean([np.square(y.qvel[:3] - s.true_qvel[:3]) for s, y in pairs]))
 
 
+@pytest.mark.slow
 def test_a_predicted_velocity_is_averaged_with_the_measured_one():
     states = record("g1", "mild", 0, Mode.MOBILE, vx=0.4)
     rng = np.random.default_rng(0)
@@ -155,6 +156,7 @@ def test_a_predicted_velocity_that_is_far_off_is_no_news(bad):
         np.testing.assert_array_equal(one.qvel, other.qvel)
 
 
+@pytest.mark.slow
 def test_the_height_of_a_walking_robot_outlasts_the_foot_that_told_it():
     errors = []
     for seed in range(4):
@@ -166,6 +168,7 @@ def test_the_height_of_a_walking_robot_outlasts_the_foot_that_told_it():
     assert np.sqrt(np.mean(np.square(errors))) < 2.0e-3  # 2.3 mm if each contact stands alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["g1", "rby1"])
 def test_a_robot_in_the_closed_loop_without_noise_is_left_where_it_is(name):
     sync = make_sync(make_robot(name))
@@ -311,6 +314,7 @@ def test_a_measurement_of_the_wrong_size_does_not_raise(robot):
     assert sync.failures == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "mode", "command", "position", "velocity"),
     [
@@ -329,6 +333,7 @@ def test_mild_noise_is_reduced(name, mode, command, position, velocity):
         assert synced[1] < velocity * raw[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "mode", "command"),
     [
@@ -373,6 +378,7 @@ def follow(robot, truths, *, mode=Mode.STATIONARY, seed=0):
     return np.array(errors), statuses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [0.02, 0.05, 0.3, 2.0])
 def test_a_robot_that_is_pushed_away_is_found_again_within_a_second(robot, shift):
     """No velocity tells of the push: the worst case."""

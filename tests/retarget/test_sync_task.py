@@ -80,6 +80,7 @@ def test_every_jacobian_equals_finite_differences(robot):
         assert check_jacobian(task, model, qpos) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", ["base", "joints", "contact"])
 def test_a_wrong_jacobian_is_caught(robot, block):
     class WrongTask(SyncTask):

@@ -113,6 +113,7 @@ def test_heights_are_read():
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("heights", "fault"),
     [

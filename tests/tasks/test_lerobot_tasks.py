@@ -10,8 +10,9 @@ from tests.recording.test_lerobot_cli import ROBOT, TELEOP, record_flags, run
 from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.tasks import dual_point_touch
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 @pytest.mark.parametrize("command", ["lerobot-record", "xop-record"])
 def test_outcome_is_recorded(tmp_path, monkeypatch, command):
     """With points that are near enough wherever they are, held for 0.2 s, success comes."""

@@ -73,6 +73,7 @@ def test_touches_both_points_whatever_the_robot_is_like(settings: dict) -> None:
     assert device.mind.diary[-1][1] == "done"
 
 
+@pytest.mark.slow
 def test_turns_round_for_what_is_behind() -> None:
     world, device = ToyWorld(make_points(bearing=2.8)), make_person(1)
     run_touch(world, device)
@@ -80,6 +81,7 @@ def test_turns_round_for_what_is_behind() -> None:
     assert any("turn round" in text for _, text in device.mind.diary)
 
 
+@pytest.mark.slow
 def test_looks_to_both_sides_before_it_turns_round() -> None:
     world, device = ToyWorld(make_points(bearing=1.4)), make_person(1)
     run_touch(world, device)
@@ -87,6 +89,7 @@ def test_looks_to_both_sides_before_it_turns_round() -> None:
     assert not any("turn round" in text for _, text in device.mind.diary)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [0.3, 0.4])
 def test_squats_and_bends_for_what_is_low(height: float) -> None:
     world, device = ToyWorld(make_points(height=height)), make_person(3)
@@ -138,6 +141,7 @@ def test_lifts_what_it_took_from_below_to_a_good_height() -> None:
     assert raised[0, 1] - raised[1, 1] == pytest.approx(low[0, 1] - low[1, 1])
 
 
+@pytest.mark.slow
 def test_same_seed_same_person_and_another_is_another() -> None:
     def record(seed: int) -> np.ndarray:
         world, device = ToyWorld(make_points()), make_person(seed)
@@ -156,6 +160,7 @@ def test_people_differ_within_bounds() -> None:
     assert np.std([person.eye_height for person in people]) == pytest.approx(0.06, rel=0.2)
 
 
+@pytest.mark.slow
 def test_moves_no_faster_than_people_do() -> None:
     world, device = ToyWorld(make_points(bearing=-2.0)), make_person(2, noise=0.0)
     run_touch(world, device)

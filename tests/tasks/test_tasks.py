@@ -87,6 +87,7 @@ def test_some_points_are_near_a_wall_and_all_inside():
     assert 30 < (gaps <= touch.NEAR_WALL[1]).sum() < 70
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_pair_of_points_is_in_reach_of_a_sensible_posture(robot):
     morphology = make_morphology(robot)
@@ -256,6 +257,7 @@ def test_hands_may_touch_the_table_and_other_parts_may_not():
     assert set(stage.status.collisions) == {("link_left_arm_3", "table"), ("ee_left", "wall_left")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_robot_squeezes_lifts_and_holds_the_box(robot):
     """By arm kinematics alone, through policy and physics: five seconds without slipping."""

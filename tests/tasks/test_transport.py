@@ -142,6 +142,7 @@ def test_toy_on_the_rim_is_none():
     assert not stage.status.success
 
 
+@pytest.mark.slow
 def test_arm_alone_carries_the_toy_over_the_obstacle_and_delivers_it():
     """By kinematics, in reach without driving: so it is for torso and arm together."""
     carry = Carry("rby1", seed=0)
