@@ -14,6 +14,7 @@ from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.errors import XopError
 from xop_lerobot.core.state import FRAMES, Goal, RobotState
 from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.morphology.limits import limit_action
 from xop_lerobot.morphology.reach import compute_forward_reach
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
@@ -26,7 +27,6 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import GestureConfig, Hands, explain_gestures, grip_from_pinch
 from xop_lerobot.operator.goal import GoalVelocity, HandBlend
 from xop_lerobot.operator.raised_hands import HOLDING
-from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.plant.watch import MOVES
 from xop_lerobot.retarget.arms.driver import ArmDriver
 from xop_lerobot.retarget.changes import Change, Settings, make_toggle, parse_change

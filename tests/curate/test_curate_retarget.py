@@ -32,7 +32,7 @@ from xop_lerobot.curate.retarget_job import (
     read_settings,
     read_weights,
 )
-from xop_lerobot.curate.retarget_worker import Retargeter
+from xop_lerobot.curate.retarget_worker import Replayer
 from xop_lerobot.operator.alignment import AlignmentConfig
 from xop_lerobot.operator.recording import Recording, load_recording, make_recording
 from xop_lerobot.recording.facts import read_facts
@@ -97,7 +97,7 @@ def record(root: Path, config: RetargetConfig, jobs: Sequence[RetargetJob]) -> P
     folder = RetargetFolder(root)
     settings = config.to_settings()
     with folder.hold(settings):
-        maker = Retargeter(config, 0.0)
+        maker = Replayer(config, 0.0)
         try:
             for job in jobs:
                 draft = folder.open_attempt(job.index)
@@ -316,7 +316,7 @@ def test_a_floor_that_is_wrong_is_told_and_the_others_are_made(source, tmp_path)
     root = record(tmp_path / "out", TOY, jobs)
     (attempt,) = json.loads((root / "meta/xop/retarget.json").read_text())["attempts"]
     assert (attempt["index"], attempt["kept"]) == (1, True)
-    maker = Retargeter(TOY, 0.0)
+    maker = Replayer(TOY, 0.0)
     try:
         refused = maker.make(jobs[0], tmp_path / "draft")
     finally:

@@ -17,9 +17,10 @@ from xop_lerobot.core.transforms import (
     rotation_error,
 )
 from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.morphology.limits import limit_action
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.plant.policy_loop import PolicyLoop, limit_action
+from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.changes import Change, apply_change, make_settings
 from xop_lerobot.retarget.config import RetargeterConfig

@@ -17,10 +17,11 @@ from xop_lerobot.core.errors import BadShape, BadValue
 from xop_lerobot.low_level.diff_drive import DiffDrive
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
+from xop_lerobot.morphology.limits import ARM_MAX_SPEED, limit_action
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.plant import Measurement, Plant
-from xop_lerobot.plant.policy_loop import ARM_MAX_SPEED, PolicyLoop, limit_action
+from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.realtime_loop import RealtimeLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.rollout import PolicyRollout

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode, RobotAction
 from xop_lerobot.core.errors import BadShape, BadValue
+from xop_lerobot.morphology.limits import limit_action
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.plant.policy_loop import limit_action
 from xop_lerobot.retarget.smoothing import CommandSmoother, compute_braking_step
 
 SPACE = CommandSpace(

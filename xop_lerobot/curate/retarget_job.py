@@ -147,7 +147,7 @@ class RetargetConfig(CollectConfig):
     retargeter: Mapping[str, Any] = field(default_factory=dict)
     alignment: Mapping[str, Any] = field(default_factory=dict)
 
-    maker: ClassVar[str] = "xop_lerobot.curate.retarget_worker:Retargeter"
+    maker: ClassVar[str] = "xop_lerobot.curate.retarget_worker:Replayer"
 
     def check(self) -> None:
         """Check all that can be checked before a robot is made; imports the plugins.

@@ -54,7 +54,7 @@ class RetargetDevice(ReplayDevice):
 DEVICES.add(DEVICE, RetargetDevice)
 
 
-class Retargeter(Collector):
+class Replayer(Collector):
     """Replays single operators, in any order.
 
     One that cannot be replayed makes an attempt without frames, which is tried again each time.

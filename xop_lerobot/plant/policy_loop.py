@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 
-from xop_lerobot.core.command import RobotAction, check_vector
+from xop_lerobot.core.command import RobotAction
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.state import RobotState, freeze
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+from xop_lerobot.morphology.limits import limit_action, round_action
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.plant.plant import Measurement, Plant
 from xop_lerobot.plant.watch import Watch
@@ -38,7 +37,7 @@ class PolicyLoop:
         self.morphology, self.plant, self.policy = morphology, plant, policy
         plant.adapt(policy)
         self._memory = policy.initial_memory(1)
-        self.action = _round_action(morphology.rest_action())
+        self.action = round_action(morphology.rest_action())
         self._previous: RobotAction | None = None  # executed before, while one is executed
         self._measurement: Measurement | None = None
         self._collision = self._was_read = False
@@ -84,7 +83,7 @@ class PolicyLoop:
         """
         self.plant.reset(seed)
         self._memory = self.policy.initial_memory(1)
-        self.action = _round_action(start or self.morphology.rest_action())
+        self.action = round_action(start or self.morphology.rest_action())
         self._measurement = None
         self.advance(settle_s)
         self._watch.reset()
@@ -158,52 +157,3 @@ class PolicyLoop:
     def close(self) -> None:
         """Close the plant; may be called twice."""
         self.plant.close()
-
-
-ARM_MAX_SPEED = 6.0
-"""Largest speed of arm targets that a robot executes [rad/s]; grippers are not limited."""
-
-
-def limit_action(
-    morphology: Morphology,
-    action: RobotAction,
-    previous: RobotAction,
-    dt: float,
-    arm_limits: Mapping[str, tuple[float, float]] = MappingProxyType({}),
-) -> RobotAction:
-    """What of `action` a robot executes after `previous` within `dt` [s].
-
-    Teleoperator and robot both call it, so that the recorded action is the executed one:
-    limiting twice is limiting once. Datasets hold single precision, so actions are rounded to
-    it, and a replayed action is the recorded one to the last bit.
-
-    Args:
-        morphology: The robot.
-        action: What is wanted.
-        previous: What was executed last.
-        dt: Time since then [s].
-        arm_limits: Angles that the robot's low-level policy keeps arm joints within [rad].
-
-    Raises:
-        BadShape: If the command or the arms have the wrong size.
-        BadValue: If the command or the arms hold a number that is not finite.
-    """
-    command = morphology.command_space.limit(action.command, previous.command, dt, action.mode)
-    num_joints = sum(len(arm.joints) for arm in morphology.arms)
-    arms = check_vector("arms", action.arms, len(morphology.arm_names)).copy()
-    for joint, (low, high) in arm_limits.items():
-        place = morphology.arm_names.index(joint)
-        arms[place] = min(max(arms[place], low), high)
-    reach = ARM_MAX_SPEED * dt
-    arms[:num_joints] = np.clip(
-        arms[:num_joints], previous.arms[:num_joints] - reach, previous.arms[:num_joints] + reach
-    )
-    return _round_action(RobotAction(command, action.mode, arms))
-
-
-def _round_action(action: RobotAction) -> RobotAction:
-    return RobotAction(_to_single(action.command), action.mode, _to_single(action.arms))
-
-
-def _to_single(vector: np.ndarray) -> np.ndarray:
-    return vector.astype(np.float32).astype(float)
