@@ -284,7 +284,8 @@ class Totals:
             mean, low_text, high_text = (
                 format_value(name, float(each)) for each in (total / count, low, high)
             )
-            lines.append(f"{name}: {mean} {unit}, {low_text} to {high_text}".replace(" ,", ","))
+            spread = f", {low_text} to {high_text}" if count > 1 else ""
+            lines.append(f"{name}: {mean} {unit}".rstrip() + spread)
         return "\n".join(lines)
 
 

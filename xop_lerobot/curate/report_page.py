@@ -89,6 +89,7 @@ def _make_heading(finding: Finding) -> str:
         text = bad if value and name != "success" else text
         if text:
             kind = "good" if text == good else "bad"
+            kind += " failed" if name == "success" and kind == "bad" else ""
             marks.append(f'<span class="mark {kind}">{escape(text)}</span>')
     chips = [
         f"<span><small>{escape(name.replace('_', ' '))}</small> "
@@ -255,6 +256,7 @@ class Report:
         self._draft = path.with_name(f".{path.name}.tmp")
         self._totals = Totals(SUMMARISED)
         self._unknown = set(FIGURES)
+        self._judged = _has_task(source)
         self._shown = self.episodes = self.faulty = 0
         self._files = ExitStack()
         self._made: list[Path] = []
@@ -320,6 +322,7 @@ class Report:
             self._shown += 1
         self._totals.add(finding.figures, bool(problems))
         self.episodes, self.faulty = self.episodes + 1, self.faulty + bool(problems)
+        self._judged |= finding.figures.get("success") is True
         self._unknown -= {name for name, value in finding.figures.items() if value is not None}
         values = [
             float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
@@ -341,12 +344,14 @@ class Report:
             with self._draft.open("w", encoding="utf-8") as page:
                 page.write(make_head(f"Dataset {self._source.root.resolve().name}", style))
                 page.write(self._make_summary(faults, missing))
-                page.write((_ASSETS / "report.html").read_text(encoding="utf-8"))
+                page.write((_ASSETS / "table.html").read_text(encoding="utf-8"))
                 page.write('<script type="application/json" id="figures">')
-                page.write(f'{{"figures":{dump_script(self._list_figures())},"rows":[')
+                page.write(f'{{"judged":{dump_script(self._judged)},')
+                page.write(f'"figures":{dump_script(self._list_figures())},"rows":[')
                 _copy(self._rows, page)
                 page.write(f"]}}</script>\n<h2>Episode by episode</h2>\n{self._make_note()}\n")
                 _copy(self._sections, page)
+                page.write((_ASSETS / "plots.html").read_text(encoding="utf-8"))
                 page.write(f"<script>\n{script}</script>{FOOT}")
                 page.flush()
                 os.fsync(page.fileno())
@@ -419,6 +424,12 @@ class Report:
                 f"chosen; --detailed and --episodes choose others. {text}"
             )
         return f'<p class="note" id="limits">{escape(text)}</p>'
+
+
+def _has_task(source: Source) -> bool:
+    """Whether a task of this project ran, which judges its episodes."""
+    robot = source.read_config().get("robot")
+    return not isinstance(robot, dict) or bool(robot.get("task", True))
 
 
 def _copy(source: IO[str], target: IO[str]) -> None:

@@ -1,7 +1,10 @@
 "use strict";
 // Table, plots and timelines of a report. All data are in the page; nothing is fetched.
 
-const { figures, rows } = JSON.parse(document.getElementById("figures").textContent);
+const { figures, rows, judged } = JSON.parse(document.getElementById("figures").textContent);
+// Where no task ran and nobody marked an episode, no success is no failure.
+document.body.classList.toggle("unjudged", !judged);
+document.body.classList.toggle("single", rows.length === 1);
 const place = Object.fromEntries(figures.map((figure, i) => [figure.name, i]));
 const COLOURS = ["#2166ac", "#d6604d", "#1b7837", "#9970ab", "#b8860b", "#17a0a8", "#c51b7d",
   "#555555", "#7fbc41", "#e08214", "#4d4dff"];
@@ -9,7 +12,7 @@ const STATE = { good: "#1b7837", bad: "#b2182b", unknown: "#777777" };
 const MOST_ROWS = 1000, MOST_POINTS = 1500, BINS = 20;
 
 const get = (row, name) => row[0][place[name]];
-const stateOf = (row) => ({ true: "good", false: "bad" })[get(row, "success")] || "unknown";
+const stateOf = (row) => ({ true: "good", false: judged ? "bad" : "unknown" })[get(row, "success")] || "unknown";
 const find = (id) => document.getElementById(id);
 
 function make(kind, options = {}, ...children) {
@@ -90,7 +93,7 @@ function showTable() {
         cell.textContent = format(value, figure);
       }
       if (figure.kind === "text") cell.title = value ?? "";
-      if (figure.name === "success" && value !== null) cell.classList.add(value ? "good" : "bad");
+      if (figure.name === "success" && value !== null) cell.classList.add(stateOf(row));
       if (["fall", "collision", "trouble", "late"].includes(figure.name) && value) cell.classList.add("bad");
       line.append(cell);
     }
@@ -174,7 +177,7 @@ function thinOut(points) {
 function plot(xName, yName, width, height, bars) {
   const svg = draw("svg", { viewBox: `0 0 ${width} ${height}`, role: "img",
     "aria-label": `${yName} over ${xName}` });
-  const box = { left: 46, right: width - (bars ? 66 : 14), top: 24, bottom: height - 34 };
+  const box = { left: 62, right: width - (bars ? 66 : 14), top: 24, bottom: height - 34 };
   const all = rows.map((row) => ({ row, x: get(row, xName), y: get(row, yName) }))
     .filter((point) => point.x !== null && point.y !== null);
   const unit = figures[place[yName]].unit;
