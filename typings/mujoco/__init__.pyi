@@ -1,4 +1,4 @@
-"""MuJoCo is compiled and its wheel has no stubs: its classes by name, what they hold of any type."""
+"""MuJoCo is compiled and its wheel has no stubs: its classes by name, what they hold as Any."""
 
 from typing import Any
 
