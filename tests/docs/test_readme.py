@@ -195,6 +195,16 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_modules_that_are_named_exist(page: Path) -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("this is no checkout")
+    files = [f"/{file}" for file in listed.stdout.split()]
+    for name in re.findall(r"`([a-z_0-9/]+\.py)`", page.read_text()):
+        assert any(file.endswith(f"/{name}") for file in files), f"{page.name} names {name}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_examples_are_python(page: Path) -> None:
     for block in read_blocks(page, "python"):
         ast.parse(block, str(page))
