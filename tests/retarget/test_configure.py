@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 
+import cem  # noqa: F401  registers it
 import numpy as np
 import pytest
 

@@ -67,7 +67,7 @@ class MpcConfig:
     """Model predictive controller of one robot in one mode.
 
     Attributes:
-        optimizer: Name of the sampling optimizer: `kmppi`, `cem`, or a registered one.
+        optimizer: Name of the sampling optimizer: `kmppi`, or a registered one.
         num_samples: Rollouts per solve N, fixed candidates included [1].
         horizon: Length H of a rollout in low-level control steps of 20 ms [1].
         num_knots: Support points of the kernel interpolation [1].
@@ -81,8 +81,7 @@ class MpcConfig:
         noise_std: Standard deviation of the samples by command name [its unit].
         temperature: λ of weighting `raw` [cost], or of `minmax` [share of the cost's range];
             also that of `importance_cost`.
-        effective_samples: Effective sample size that weighting `ess` aims at, and number of
-            elites of `cem` [1].
+        effective_samples: Effective sample size that weighting `ess` aims at [1].
         weighting: How costs become weights: `raw`, `minmax` or `ess`.
         importance_cost: Whether MPPI's importance-sampling term is part of the cost.
         min_noise: Share of `noise_std` that is left when the robot is at its goal [1].

@@ -1,4 +1,4 @@
-"""The cross-entropy method over kernel-interpolated support points."""
+"""The cross-entropy method over kernel-interpolated support points: an optimizer of one's own."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import numpy as np
 
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.kmppi import Kmppi
-from xop_lerobot.retarget.optimizer import Samples
+from xop_lerobot.retarget.optimizer import OPTIMIZERS, Samples
 
 _LEAST = 0.3  # share of the noise that is always left
 
 
+@OPTIMIZERS.register("cem")
 class Cem(Kmppi):
     """The plan becomes the mean of the best samples, and the noise adapts to their spread.
 
