@@ -99,7 +99,7 @@ def test_a_way_computed_anew_goes_on_as_before(planner, rby1):
     x, y, yaw, v, w = rby1.pivot, 0.0, 0.0, 0.0, 0.0
     from xop_lerobot.retarget.guidance.route import _Aim, _clamp, _steer
 
-    aim = _Aim(goal[0], goal[1], 0.3, 1.9, (RESTING - rby1.pivot, 0.0))
+    aim = _Aim(goal[0], goal[1], 0.3, 1.9, (RESTING - rby1.pivot, 0.0), rby1.driving)
     for _ in range(12):
         wanted = _steer(aim, x, y, yaw)
         v += _clamp(wanted[0] - v, 1.5 * 0.04)

@@ -15,7 +15,7 @@ import numpy as np
 from xop_lerobot.core.command import ActionLayout, CommandSpace, Mode, RobotAction
 from xop_lerobot.core.registry import Registry
 from xop_lerobot.morphology.effect import Effect
-from xop_lerobot.morphology.tuning import MpcConfig, PaperParameters
+from xop_lerobot.morphology.tuning import Driving, MpcConfig, PaperParameters
 
 if TYPE_CHECKING:
     import mujoco
@@ -130,6 +130,8 @@ class Morphology(ABC):
     None for a base that does not, or of which that is not known."""
     pivot: float = 0.0
     """Forward distance from the base's frame to its centre of turning [m]."""
+    driving: Driving | None = None
+    """How it drives along a path; None for a base that goes to any side."""
     support: tuple[tuple[float, float], ...] = ()
     """Corners (x, y) in the base's frame, counterclockwise, of the area on which a robot that
     cannot step stands [m]; empty for one whose policy keeps the balance."""

@@ -175,6 +175,41 @@ class PaperParameters:
     control_hz: float
 
 
+@dataclass(frozen=True)
+class Driving:
+    """How a base that cannot go sideways drives along a path, gently enough for what stands on it.
+
+    Attributes:
+        speed: Largest speed [m/s].
+        acceleration: Of the drive [m/s²].
+        braking: Of the drive [m/s²].
+        turn: Largest yaw rate [rad/s].
+        turn_acceleration: Of the turn [rad/s²].
+        turn_braking: Of the turn [rad/s²].
+        centripetal: Largest acceleration across the heading: a tall robot tips over [m/s²].
+        detour_speed: Speed of a drive that makes room for a turn [m/s].
+        waist: Largest twist of the waist that turns the head [rad].
+        waist_speed: Its speed [rad/s].
+        arrival_twist: Largest twist in which the robot arrives [rad].
+        turning_twist: The same behind a goal that turns [rad].
+        lean: Distance that the torso bridges by itself [m].
+    """
+
+    speed: float
+    acceleration: float
+    braking: float
+    turn: float
+    turn_acceleration: float
+    turn_braking: float
+    centripetal: float
+    detour_speed: float
+    waist: float
+    waist_speed: float
+    arrival_twist: float
+    turning_twist: float
+    lean: float
+
+
 def _check_positive(name: str, value: float) -> None:
     if not (math.isfinite(value) and value > 0):
         raise BadValue(f"{name} must be positive and finite, got {value}")

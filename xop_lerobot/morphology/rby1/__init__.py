@@ -17,6 +17,7 @@ from xop_lerobot.morphology.morphology import (
 )
 from xop_lerobot.morphology.rby1.links import LINKS
 from xop_lerobot.morphology.rby1.mpc import (
+    DRIVING,
     EFFECTS,
     HULL,
     PIVOT,
@@ -132,6 +133,7 @@ class RBY1(Morphology):
     servo_gap = 0.15
     posture_limits = POSTURE_LIMITS
     standing_reach = STANDING_REACH
+    driving = DRIVING
     point_heights, top_heights = (0.25, 1.5), (0.3, 1.3)
     # Between the fingers of its hand is a gap, through which a toy would fall.
     work = Work(press=0.01, tray=True)

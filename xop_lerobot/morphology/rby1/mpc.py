@@ -6,7 +6,7 @@ import math
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.morphology.effect import Acts, Effect
-from xop_lerobot.morphology.tuning import CostWeights, MpcConfig
+from xop_lerobot.morphology.tuning import CostWeights, Driving, MpcConfig
 
 PIVOT = 0.228
 """The wheels' axle is this far ahead of the base frame [m]."""
@@ -36,6 +36,24 @@ EFFECTS = (
         for i, effort in enumerate((10.0, 4.0, 4.0, 4.0, 10.0, 1.0))
     ),
 )
+
+DRIVING = Driving(
+    speed=1.2,
+    acceleration=1.5,
+    braking=1.0,
+    turn=1.4,
+    turn_acceleration=3.0,
+    turn_braking=2.0,
+    centripetal=0.6,
+    detour_speed=0.5,
+    waist=2.2,
+    waist_speed=1.5,
+    arrival_twist=1.9,
+    turning_twist=0.6,
+    lean=0.1,
+)
+"""Braked more gently than the wheels could, for the height of what stands on them; the waist keeps
+clear of its joint's limit."""
 
 POSTURE_LIMITS = {"torso_2": (-math.inf, 0.0)}
 """Its knees bend to the front. Bent to the back they take it to places that servos do not hold:

@@ -205,8 +205,11 @@ class Guidance:
     ) -> None:
         self._command_model = command_model
         self._facing = FacingRule(morphology, resting)
-        self._room = TwistRoom(morphology) if command_model.is_nonholonomic else None
-        self._routes = RoutePlanner(morphology, resting, footprint)
+        self._room: TwistRoom | None = None
+        self._routes: RoutePlanner | None = None
+        if command_model.is_nonholonomic:
+            self._room = TwistRoom(morphology)
+            self._routes = RoutePlanner(morphology, resting, footprint)
 
     def reset(self) -> None:
         """Start anew."""
@@ -275,6 +278,7 @@ class Guidance:
         ahead: Mapping[str, float],
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Goals where the base will have carried the frame `name`; the others go with it."""
+        assert self._routes is not None
         route = self._routes.plan(
             qpos,
             (float(twist[0]), float(twist[2])),

@@ -15,6 +15,7 @@ import numpy as np
 
 from xop_lerobot.core.transforms import compute_heading, quat_yaw
 from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.tuning import Driving
 from xop_lerobot.retarget.obstacles import Obstacle, ObstacleSet
 
 
@@ -68,27 +69,19 @@ class Footprint:
 
 
 _DT = 0.04  # step of the simulated way [s]
-_MAX_SPEED, _ACCELERATION, _BRAKING = 1.2, 1.5, 1.0  # [m/s], [m/s²], [m/s²]
-_MAX_TURN, _TURN_ACCELERATION, _TURN_BRAKING = 1.4, 3.0, 2.0  # [rad/s], [rad/s²], [rad/s²]
-_CENTRIPETAL = 0.6  # largest acceleration across the heading: a tall robot tips over [m/s²]
 _FINE = 6.0  # gain of the last centimetres and degrees, where the braking law is too steep [1/s]
 _FINE_DRIVE, _FINE_TURN = 0.05, 0.1  # within which that gain holds [m], [rad]
 _BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
 _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
-_MAX_TWIST = 1.9  # largest twist of the waist in which the robot arrives [rad]
-_WAIST_LIMIT, _WAIST_SPEED = 2.2, 1.5  # of the waist that turns the head [rad], [rad/s]
 _ROOM_SPARE = 0.1  # by which a waist that waits for its base may be beyond what arms let it [rad]
 _RESTING, _TURNING = 0.15, 0.45  # yaw rates of a goal that rests and of one that turns [rad/s]
-_TURNING_TWIST = 0.6  # largest twist of the waist behind such a goal [rad]
 _TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
 _CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
 _MUST_TURN = 0.05  # turn back into what the waist allows from which on it comes first [rad]
 _CLOSE_TURNING = 0.35  # that distance meanwhile: a turn carries the head off [m]
 _LINE_UP = 0.2  # distance of the place at which its heading counts like the way to it [m]
-_LEAN = 0.1  # distance that the torso bridges by itself [m]
 _ITERATIONS = 4  # place and heading of the arrival depend on each other
 _DETOURS = (0.4, -0.4, 0.8, -0.8)  # drives straight on or back before a turn that is barred [m]
-_DETOUR_SPEED = 0.5  # [m/s]
 _DETOUR_FROM = 0.3  # distance from the goal under which none is made: it would dance there [m]
 _DEEPER = 0.005  # by which an obstacle must come nearer than touching to bar the way [m]
 _TURNED = 0.15  # turn that is still to come where the way is barred [rad]
@@ -130,13 +123,14 @@ class Route:
 
 
 class _Aim(NamedTuple):
-    """What is to be carried where: goal x, y, where it looks, and how it sits on the axle."""
+    """What is to be carried where and how: goal x, y, where it looks, how it sits on the axle."""
 
     x: float
     y: float
     look: float
     twist: float
     carried: tuple[float, float]
+    driving: Driving
 
     def clip(self, heading: float) -> float:
         """The heading nearest to `heading` in which the base may arrive [rad]."""
@@ -152,8 +146,8 @@ class RoutePlanner:
     r"""Simulates how a base with two wheels drives to its goal as fast as its limits allow.
 
     The axle's place p* depends on the heading ψ* in which the base arrives; a waist that turns
-    leaves that free by `_MAX_TWIST` on either side of where the goal looks, so that the base
-    mostly need not turn again once it is there. It turns towards :math:`\pm(p^* - p)`, forwards
+    leaves that free by `Driving.arrival_twist` on either side of where the goal looks, so that the
+    base mostly need not turn again once it is there. It turns towards :math:`\pm(p^* - p)`, forwards
     or backwards, whatever costs less of a turn and of a twist, by the braking law
     :math:`\omega = \sqrt{2\alpha|e|}`, and drives by the same law as far as it faces its way,
     :math:`v = \cos^4 e\,\sqrt{2 b d}`. Both depend on the present state alone, so that a way
@@ -183,6 +177,8 @@ class RoutePlanner:
     ) -> None:
         self._footprint = footprint
         self._pivot, self._resting = morphology.pivot, dict(resting)
+        assert morphology.driving is not None, f"how {morphology.name} drives is not known"
+        self._driving = morphology.driving
         self._hands = {arm.frame for arm in morphology.arms}
 
     def plan(
@@ -211,19 +207,20 @@ class RoutePlanner:
             room: How far the arms let the waist twist [rad].
             ahead: How far ahead of the base it will be, where not as at rest [m].
         """
-        heading = float(quat_yaw(qpos[3:7]))
+        drive, heading = self._driving, float(quat_yaw(qpos[3:7]))
         x = float(qpos[0]) + self._pivot * math.cos(heading)
         y = float(qpos[1]) + self._pivot * math.sin(heading)
         gx, gy = float(goal[0]), float(goal[1])
         if name in self._hands:
             carried = _rotate(float(pose[0]) - x, float(pose[1]) - y, -heading)
-            aim = _Aim(gx, gy, heading, 0.0, carried)
+            aim = _Aim(gx, gy, heading, 0.0, carried, drive)
         else:
             resting = self._resting[name] if ahead is None else ahead
             carried = (resting - self._pivot, 0.0)
             turning = min(max((abs(turn_rate) - _RESTING) / (_TURNING - _RESTING), 0.0), 1.0)
-            twist = min(_MAX_TWIST + turning * (_TURNING_TWIST - _MAX_TWIST), room)
-            aim = _Aim(gx, gy, float(compute_heading(goal[3:])), twist, carried)
+            most = drive.arrival_twist
+            twist = min(most + turning * (drive.turning_twist - most), room)
+            aim = _Aim(gx, gy, float(compute_heading(goal[3:])), twist, carried, drive)
         count = math.ceil(duration / _DT) + 1
         way = _simulate(aim, x, y, heading, speeds, count)
         if self._footprint is not None and math.dist(way[0, :2], (gx, gy)) > _DETOUR_FROM:
@@ -233,14 +230,15 @@ class RoutePlanner:
         offsets[:, 0] += cosine * carried[0] - sine * carried[1]
         offsets[:, 1] += sine * carried[0] + cosine * carried[1]
         far = np.hypot(offsets[:, 0], offsets[:, 1])
-        offsets *= np.maximum(0.0, 1 - _LEAN / np.maximum(far, _LEAN))[:, None]
+        offsets *= np.maximum(0.0, 1 - drive.lean / np.maximum(far, drive.lean))[:, None]
         twisted = abs(_wrap(aim.look - heading)) - (aim.twist or math.pi)
-        share = max(float(far[0]) / _LEAN - 1.0, twisted / _TWIST_RAMP)
+        share = max(float(far[0]) / drive.lean - 1.0, twisted / _TWIST_RAMP)
         share = min(max(share, 0.0), 1.0)
         turns = np.zeros(count)
         if name not in self._hands:
-            limit = min(_WAIST_LIMIT, room + _ROOM_SPARE)
-            turns = _unwind(float(compute_heading(pose[3:])) - heading, aim.look, way[:, 2], limit)
+            limit = min(drive.waist, room + _ROOM_SPARE)
+            twist = float(compute_heading(pose[3:])) - heading
+            turns = _unwind(twist, aim.look, way[:, 2], limit, drive.waist_speed)
         return Route(np.arange(count) * _DT, offsets, way[:, 2], turns, share)
 
     def _find_free(self, way: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:
@@ -278,18 +276,20 @@ def _simulate(
     for i in range(count):
         way[i] = x, y, heading
         if left > 0:
-            wanted_v, wanted_w = math.copysign(_DETOUR_SPEED, detour), 0.0
+            wanted_v, wanted_w = math.copysign(aim.driving.detour_speed, detour), 0.0
             left -= abs(v) * _DT
         else:
             wanted_v, wanted_w = _steer(aim, x, y, heading)
-        v += _clamp(wanted_v - v, _ACCELERATION * _DT)
-        w += _clamp(wanted_w - w, _TURN_ACCELERATION * _DT)
+        v += _clamp(wanted_v - v, aim.driving.acceleration * _DT)
+        w += _clamp(wanted_w - w, aim.driving.turn_acceleration * _DT)
         dx, dy = _rotate(v * _DT, 0.0, heading + w * _DT / 2)
         x, y, heading = x + dx, y + dy, heading + w * _DT
     return way
 
 
-def _unwind(twist: float, look: float, headings: np.ndarray, limit: float) -> np.ndarray:
+def _unwind(
+    twist: float, look: float, headings: np.ndarray, limit: float, speed: float
+) -> np.ndarray:
     """Turns of the head from where its goal looks, as the waist gets there by its front [rad].
 
     A waist at its limit on one side, whose goal is just beyond that of the other, has to go all
@@ -301,7 +301,7 @@ def _unwind(twist: float, look: float, headings: np.ndarray, limit: float) -> np
         if abs(wanted) > limit:  # out of reach on either side: wait on this one
             wanted = math.copysign(limit, twist)
         if i:
-            twist += _clamp(wanted - twist, _WAIST_SPEED * _DT)
+            twist += _clamp(wanted - twist, speed * _DT)
         turns[i] = _wrap(heading + twist - look)
     return turns
 
@@ -316,10 +316,10 @@ def _steer(aim: _Aim, x: float, y: float, heading: float) -> tuple[float, float]
         turn, dx, dy = min(
             (_face(aim, x, y, heading, sign) for sign in (1.0, -1.0)), key=lambda way: way[0]
         )[1:]
-    along = dx * math.cos(heading) + dy * math.sin(heading)
-    v = _brake(along, _BRAKING, _FINE_DRIVE) * max(0.0, math.cos(turn)) ** 4
-    w = _clamp(_brake(turn, _TURN_BRAKING, _FINE_TURN), _MAX_TURN)
-    return _clamp(v, min(_MAX_SPEED, _CENTRIPETAL / max(abs(w), 1e-6))), w
+    along, drive = dx * math.cos(heading) + dy * math.sin(heading), aim.driving
+    v = _brake(along, drive.braking, _FINE_DRIVE) * max(0.0, math.cos(turn)) ** 4
+    w = _clamp(_brake(turn, drive.turn_braking, _FINE_TURN), drive.turn)
+    return _clamp(v, min(drive.speed, drive.centripetal / max(abs(w), 1e-6))), w
 
 
 def _face(
