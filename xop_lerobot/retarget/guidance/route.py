@@ -147,8 +147,8 @@ class RoutePlanner:
 
     The axle's place p* depends on the heading ψ* in which the base arrives; a waist that turns
     leaves that free by `Driving.arrival_twist` on either side of where the goal looks, so that the
-    base mostly need not turn again once it is there. It turns towards :math:`\pm(p^* - p)`, forwards
-    or backwards, whatever costs less of a turn and of a twist, by the braking law
+    base mostly need not turn again once it is there. It turns towards :math:`\pm(p^* - p)`,
+    forwards or backwards, whatever costs less of a turn and of a twist, by the braking law
     :math:`\omega = \sqrt{2\alpha|e|}`, and drives by the same law as far as it faces its way,
     :math:`v = \cos^4 e\,\sqrt{2 b d}`. Both depend on the present state alone, so that a way
     that is computed anew goes on as before.
