@@ -30,7 +30,7 @@ class RestMap:
     r"""Pitch and place of a standing robot's base as a function of two entries of its command.
 
     A policy that balances a low or bent robot leans its pelvis and moves its hips unasked. The map
-    is measured on a grid (`benchmarks/run_policies.py --parts rest`) and bilinear between:
+    is measured on a grid (`python -m benchmarks.run_policies --parts rest`) and bilinear between:
     :math:`g(a) = \sum_{ij} \lambda_i(a_1) \lambda_j(a_2) g_{ij}`; beyond the grid it stays as at
     its edge.
 
