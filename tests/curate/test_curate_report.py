@@ -22,7 +22,7 @@ from xop_lerobot.curate.report_page import Limits, Report
 from xop_lerobot.curate.source import Source
 from xop_lerobot.curate.survey import survey
 from xop_lerobot.curate.timeline import decode, encode, thin
-from xop_lerobot.recording.facts import EPISODES_FILE
+from xop_lerobot.recording.facts import CONFIG_FILE, EPISODES_FILE
 
 EPISODES, FRAMES = 6, 100
 EVIL = "</script><img src=x onerror=\"document.title='evil'\">"
@@ -356,3 +356,26 @@ def test_scripts_hold_any_text():
     text = dump_script({"a": EVIL, "b": "\u2028 ü"})
     assert "<" not in text
     assert json.loads(text) == {"a": EVIL, "b": "\u2028 ü"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["", "dual_point_touch"])
+def test_what_no_task_judged_has_not_failed(browser, tmp_path, task):
+    """Without a task and without a mark nothing is red; one episode is shown without a table."""
+    root = make_synthetic(tmp_path / "data", 1, 20)
+    path = root / CONFIG_FILE
+    path.write_text(json.dumps({"robot": {"task": task}}))
+    column = root / "data/chunk-000/file-000.parquet"
+    kind = pq.read_schema(column).field("next.success").type
+    lost = pa.array([False] * 20, kind)
+    rewrite(column, {"next.success": lost})
+    file = root / EPISODES_FILE
+    facts = [{**json.loads(line), "success": False} for line in file.read_text().splitlines()]
+    file.write_text("".join(json.dumps(each) + "\n" for each in facts))
+    assert main(["report", "--root", str(root), "--out", str(tmp_path / "page.html")]) == 0
+    with open_page(browser, tmp_path / "page.html") as page:
+        assert page.locator(".mark.failed").first.is_visible() == bool(task)
+        assert not page.locator("#table").is_visible()
+        assert not page.locator("#plots").is_visible()
+        assert page.locator(".episode h3").is_visible()
+        assert "20.0 to" not in page.inner_text("#summary")
