@@ -37,7 +37,6 @@ from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.model.posture import Repertoire
 from xop_lerobot.retarget.mpc import MpcRetargeter
-from xop_lerobot.retarget.posture_guide import make_static_load
 from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
@@ -86,8 +85,8 @@ def draw_goals(retargeter: MpcRetargeter, count: int, seed: int) -> np.ndarray:
         morphology.standing_qpos(),
         morphology.frames["head"],
         morphology.base_body,
-        retargeter.support,
-        make_static_load(morphology, model),
+        retargeter.problem.support,
+        retargeter.problem.load,
     )
     poses = repertoire.poses
     upright = 1 - 2 * np.square(poses[:, 4:6]).sum(axis=1)
@@ -119,7 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
     assert isinstance(retargeter, MpcRetargeter)
 
     def measure() -> dict[str, np.ndarray]:
-        return retargeter.readings.compute_poses(loop.state.true_qpos, morphology.frames)
+        return retargeter.problem.readings.compute_poses(loop.state.true_qpos, morphology.frames)
 
     frames = measure()
     head = frames.pop("head")

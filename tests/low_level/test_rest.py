@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.low_level.rest import RestMap
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel, Start
 
 HEIGHTS, PITCHES = [0.4, 0.5, 0.6, 0.8], [-0.5, 0.0, 0.4]
 HEIGHT, PITCH = 0, 3
@@ -106,13 +108,13 @@ def test_the_base_goes_to_where_it_rests(model):
     (forward,), (pitch,) = np.diff(rests.forward), np.diff(rests.pitch)
     qpos = make_morphology("g1").standing_qpos()
     qpos[3:7] = quat_from_yaw(np.pi / 2)
-    got = command_model.extrapolate(qpos, command, 60.0, Mode.STATIONARY, settled=settled)
+    got = command_model.extrapolate(Start(qpos, settled=settled), command, 60.0, Mode.STATIONARY)
     np.testing.assert_allclose(got[:2], [0, forward], atol=1e-9)
     gravity = compute_projected_gravity(got[None, 3:7])[0]
     np.testing.assert_allclose(gravity[:2], [np.sin(pitch), 0], atol=1e-9)
-    stays = command_model.extrapolate(qpos, settled, 60.0, Mode.STATIONARY, settled=settled)
+    stays = command_model.extrapolate(Start(qpos, settled=settled), settled, 60.0, Mode.STATIONARY)
     np.testing.assert_allclose(stays[3:7], qpos[3:7], atol=1e-12)
-    walks = command_model.extrapolate(qpos, command, 60.0, Mode.MOBILE, settled=settled)
+    walks = command_model.extrapolate(Start(qpos, settled=settled), command, 60.0, Mode.MOBILE)
     np.testing.assert_allclose(walks[3:7], qpos[3:7], atol=1e-12)
 
 
@@ -128,13 +130,15 @@ def test_the_derivative_equals_finite_differences(model, ramped, held):
     command = space.neutral + 0.1 * rng.normal(size=len(space))
     executed = command + 0.1 * space.max_rate * DT * rng.normal(size=len(space))
     offset = 0.02 * rng.normal(size=len(space))
-    arguments = (DT, Mode.STATIONARY, None, executed if ramped else None, offset, settled)
-    future, got = command_model.linearise(qpos, command, *arguments)
-    batch = command_model.extrapolate(qpos[None], command[None], *arguments)
+    start = Start(qpos, executed if ramped else None, None, offset, settled)
+    future, got = command_model.linearise(start, command, DT, Mode.STATIONARY)
+    many = replace(start, qpos=qpos[None])
+    batch = command_model.extrapolate(many, command[None], DT, Mode.STATIONARY)
     np.testing.assert_allclose(future, batch[0], atol=1e-12)
     for i, step in enumerate(1e-6 * np.eye(len(command))):
         ahead, behind = (
-            command_model.extrapolate(qpos, command + sign * step, *arguments) for sign in (1, -1)
+            command_model.extrapolate(start, command + sign * step, DT, Mode.STATIONARY)
+            for sign in (1, -1)
         )
         tangent = np.empty(model.nv)
         mujoco.mj_differentiatePos(model, tangent, 2e-6, behind, ahead)
@@ -149,8 +153,8 @@ def test_a_joint_that_is_held_stays_while_the_robot_stands(model):
     address = model.joint("waist_pitch_joint").qposadr[0]
     command = command_model.space.neutral.copy()
     command[PITCH] = 0.3
-    stands = command_model.extrapolate(qpos, command, 60.0, Mode.STATIONARY)
-    walks = command_model.extrapolate(qpos, command, 60.0, Mode.MOBILE)
+    stands = command_model.extrapolate(Start(qpos), command, 60.0, Mode.STATIONARY)
+    walks = command_model.extrapolate(Start(qpos), command, 60.0, Mode.MOBILE)
     assert stands[address] == 0
     assert walks[address] == pytest.approx(0.3)
 
@@ -163,7 +167,7 @@ def test_a_body_that_may_not_move_is_not_asked_to_lean(model):
     qpos = make_morphology("g1").standing_qpos()
     command = command_model.space.neutral.copy()
     command[[HEIGHT, PITCH]] = 0.5, 0.4
-    got = command_model.extrapolate(qpos, command, 60.0, Mode.STATIONARY)
+    got = command_model.extrapolate(Start(qpos), command, 60.0, Mode.STATIONARY)
     np.testing.assert_array_equal(got[3:7], qpos[3:7])
 
 

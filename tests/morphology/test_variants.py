@@ -58,7 +58,9 @@ class Bench:
 
     def pose(self, frame: str) -> np.ndarray:
         sites = {frame: self.morphology.frames[frame]}
-        return self.retargeter.readings.compute_poses(self.loop.state.true_qpos, sites)[frame]
+        return self.retargeter.problem.readings.compute_poses(self.loop.state.true_qpos, sites)[
+            frame
+        ]
 
     def change(self, **values) -> None:
         self.settings = apply_change(self.morphology, self.settings, Change(**values))

@@ -50,12 +50,14 @@ class Bench:
         )
         self.retargeter.reset(self.loop.state)
         sites = {"head": self.morphology.frames["head"]}
-        self.head = self.retargeter.readings.compute_poses(self.loop.state.qpos, sites)["head"]
+        self.head = self.retargeter.problem.readings.compute_poses(self.loop.state.qpos, sites)[
+            "head"
+        ]
         self.sampled: list[Samples] = []
         self.costs: list[np.ndarray] = []
         self.evaluations: list = []
         for planner in self.retargeter._planners.values():
-            self._watch(planner)
+            self._watch(planner.optimizer)
         self._watch_evaluations()
 
     def _watch(self, planner) -> None:
@@ -72,13 +74,13 @@ class Bench:
         planner.sample, planner.update = watched_sample, watched_update
 
     def _watch_evaluations(self) -> None:
-        evaluate = self.retargeter._evaluate
+        evaluate = self.retargeter.problem._evaluate
 
         def watched(*args):
             self.evaluations.append(evaluate(*args))
             return self.evaluations[-1]
 
-        self.retargeter._evaluate = watched  # type: ignore[method-assign]
+        self.retargeter.problem._evaluate = watched  # type: ignore[method-assign]
 
     def make_goal(self, mode: Mode, offset=(0.25, 0.05, -0.05)) -> Goal:
         pose = self.head.copy()
@@ -184,7 +186,7 @@ def test_control_counts_from_its_reference(bench, name, mode, kind):
     # What is not decided is the same in all samples, and must not count.
     rest = evaluation.commands[..., ~acting] - evaluation.reference[~acting]
     np.testing.assert_array_equal(rest, 0)
-    (control,) = (cost for cost in retargeter.costs if cost.name == "control")
+    (control,) = (cost for cost in retargeter.problem.costs if cost.name == "control")
     share = (evaluation.commands - evaluation.reference) / control.scale
     slow = evaluation.weights.control * np.square(share).sum(-1).mean(-1)
     np.testing.assert_allclose(control.compute(evaluation), slow)

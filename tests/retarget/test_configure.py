@@ -39,7 +39,7 @@ class Bench:
         config = RetargeterConfig(num_samples=8, horizon=4, threads=threads)
         self.retargeter = MpcRetargeter(self.morphology, policy, model, config)
         self.retargeter.reset(self.loop.state)
-        self.poses = self.retargeter.readings.compute_poses(
+        self.poses = self.retargeter.problem.readings.compute_poses(
             self.loop.state.qpos, self.morphology.frames
         )
 
@@ -101,8 +101,8 @@ def test_a_bad_name_changes_nothing(bench, changes, text):
     bench.tick(goal)
     retargeter = bench.retargeter
     before = (
-        retargeter.configs, retargeter.frames, retargeter.constraints, retargeter.sites,
-        retargeter._planners, retargeter._noise, retargeter.candidates.proposals,
+        retargeter.configs, retargeter.frames, retargeter.constraints, retargeter.references.sites,
+        retargeter._planners, retargeter.candidates.proposals,
     )  # fmt: skip
     body = retargeter.command_model.body.copy()
     good = {
@@ -115,8 +115,8 @@ def test_a_bad_name_changes_nothing(bench, changes, text):
         retargeter.configure(**(good | changes))
     assert str(caught.value).startswith(text)
     after = (
-        retargeter.configs, retargeter.frames, retargeter.constraints, retargeter.sites,
-        retargeter._planners, retargeter._noise, retargeter.candidates.proposals,
+        retargeter.configs, retargeter.frames, retargeter.constraints, retargeter.references.sites,
+        retargeter._planners, retargeter.candidates.proposals,
     )  # fmt: skip
     assert all(old is new for old, new in zip(before, after, strict=True))
     np.testing.assert_array_equal(retargeter.command_model.body, body)
@@ -167,11 +167,11 @@ def test_weights_alone_leave_the_plan_and_its_optimizer(bench):
     goal = bench.make_goal((0.4, 0, 0))
     for _ in range(5):
         bench.tick(goal)
-    planners = dict(bench.retargeter._planners)
+    planners = {mode: each.optimizer for mode, each in bench.retargeter._planners.items()}
     knots = planners[Mode.MOBILE].knots.copy()
     bench.retargeter.configure(bench.weigh(position=2.0))
-    assert all(bench.retargeter._planners[mode] is planners[mode] for mode in Mode)
-    np.testing.assert_array_equal(bench.retargeter._planners[Mode.MOBILE].knots, knots)
+    assert all(bench.retargeter._planners[mode].optimizer is planners[mode] for mode in Mode)
+    np.testing.assert_array_equal(bench.retargeter._planners[Mode.MOBILE].optimizer.knots, knots)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_sizes_change_between_two_solves(bench, changes):
     last = [bench.tick(goal) for _ in range(8)][-1]
     bench.retargeter.configure(bench.replace(**changes))
     for mode in Mode:
-        held = bench.retargeter._planners[mode].commands[0, 0]
+        held = bench.retargeter._planners[mode].optimizer.commands[0, 0]
         if mode is Mode.MOBILE:
             assert held == pytest.approx(last.command[0])
     plan = bench.tick(goal)
@@ -254,7 +254,7 @@ def test_targets_and_body_bind_freely(bench):
     rest = bench.morphology.command_space.neutral
     moved = np.abs(plan.command - rest) > 1e-6
     assert [bench.morphology.command_space.names[i] for i in np.flatnonzero(moved)] == ["torso_5"]
-    hand = bench.retargeter.readings.compute_poses(
+    hand = bench.retargeter.problem.readings.compute_poses(
         bench.loop.state.qpos, {"right_wrist": "right_wrist"}
     )["right_wrist"]
     assert hand[1] - bench.poses["right_wrist"][1] > 0.03

@@ -8,7 +8,7 @@ import pytest
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.morphology.morphology import make_morphology
-from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel, Start
 from xop_lerobot.retarget.model.observers import DriftObserver
 
 DT = 0.04
@@ -43,7 +43,7 @@ def walk(
         seen = qpos.copy()
         seen[:2] += noise * rng.normal(size=2)
         observer.update(tick * DT, seen, command, moving=True)
-        qpos = model.extrapolate(qpos, command, DT, Mode.MOBILE, drift)
+        qpos = model.extrapolate(Start(qpos, drift=drift), command, DT, Mode.MOBILE)
     return qpos
 
 

@@ -179,7 +179,7 @@ class Driver:
             blind[mode] = dataclasses.replace(config, weights=weights)
         self.retargeter.configure(blind)
         (self.collision,) = (
-            cost for cost in self.retargeter.costs if isinstance(cost, CollisionCost)
+            cost for cost in self.retargeter.problem.costs if isinstance(cost, CollisionCost)
         )
         data = mujoco.MjData(model)
         data.qpos[:] = self.loop.state.qpos
@@ -193,7 +193,7 @@ class Driver:
         state = self.loop.state
         self.retargeter.reset(state)
         sites = {"head": self.morphology.frames["head"]}
-        pose = self.retargeter.readings.compute_poses(state.qpos, sites)["head"]
+        pose = self.retargeter.problem.readings.compute_poses(state.qpos, sites)["head"]
         pose[0] += 2.0
         return self.retargeter.plan(state, Goal({"head": pose}, mode=Mode.MOBILE))
 
@@ -207,7 +207,7 @@ class Driver:
         sensed = retargeter.rollout.predict(
             state.qpos, state.qvel, state.memory, np.array([limited]), state.arms, plan.mode
         ).sensordata
-        points = retargeter.readings.read(sensed, {}).points
+        points = retargeter.problem.readings.read(sensed, {}).points
         self.collision.set_obstacles([make_wall(self.front + distance)])
         return float(self.collision.compute_clearance(points)[0])
 
@@ -299,7 +299,7 @@ def test_a_robot_that_tips_over_is_told_of(roll, intervention):
         RetargeterConfig(threads=1),
     )
     retargeter.reset(state)
-    pose = retargeter.readings.compute_poses(loop.state.qpos, {"head": "head"})["head"]
+    pose = retargeter.problem.readings.compute_poses(loop.state.qpos, {"head": "head"})["head"]
     pose[0] += 0.5
     plan = retargeter.plan(state, Goal({"head": pose}, mode=Mode.MOBILE))
     assert plan.health["intervention"] == Intervention[intervention]

@@ -425,7 +425,7 @@ def test_noise_on_what_does_not_act_is_masked(many_knots):
 def test_a_plan_goes_on_where_the_last_one_was(many_knots):
     """The standing plan is shifted by the time that has passed on the robot's clock."""
     b = many_knots
-    planner = b.retargeter._planners[Mode.MOBILE]
+    planner = b.retargeter._planners[Mode.MOBILE].optimizer
     goal = b.make_goal(Mode.MOBILE, (0.1, 0, 0), 0.2)
     b.tick(goal)  # two control steps pass
     planner.knots = planner.knots + 0.1 * np.arange(4)[:, None]

@@ -370,7 +370,7 @@ def test_a_file_adds_to_the_scene(tmp_path):
     config = RetargeterConfig(threads=1, obstacles=write(tmp_path, FILE))
     retargeter = make_retargeter(config, morphology, make_policy("diff_drive"), model, scene)
     assert isinstance(retargeter, MpcRetargeter)
-    (collision,) = (cost for cost in retargeter.costs if isinstance(cost, CollisionCost))
+    (collision,) = (cost for cost in retargeter.problem.costs if isinstance(cost, CollisionCost))
     names = [obstacle.name for obstacle in collision.obstacles.obstacles]
     assert names == [
         *(obstacle.name for obstacle in scene),

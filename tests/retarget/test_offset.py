@@ -198,7 +198,7 @@ def lean(observe: bool) -> tuple[float, float]:
     sites = {"head": morphology.frames["head"]}
 
     def place() -> np.ndarray:
-        return retargeter.readings.compute_poses(loop.state.true_qpos, sites)["head"]
+        return retargeter.problem.readings.compute_poses(loop.state.true_qpos, sites)["head"]
 
     goal = place()
     goal[:3] += [0.05, 0, -0.02]

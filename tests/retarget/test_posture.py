@@ -16,6 +16,7 @@ from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.config import RetargeterConfig
+from xop_lerobot.retarget.model.command_model import PlannerState, Start
 from xop_lerobot.retarget.model.linearisation import Placement
 from xop_lerobot.retarget.model.posture import AT_REST_S
 from xop_lerobot.retarget.mpc import MpcRetargeter
@@ -47,7 +48,7 @@ class Robot:
     def rest(self, command: np.ndarray) -> np.ndarray:
         """Where it comes to rest on the spot. Shape (nq,)."""
         return self.command_model.extrapolate(
-            self.standing, command, AT_REST_S, Mode.STATIONARY, settled=command
+            Start(self.standing, settled=command), command, AT_REST_S, Mode.STATIONARY
         )
 
     def place(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -57,10 +58,10 @@ class Robot:
 
     def is_held(self, qpos: np.ndarray) -> bool:
         """Whether it can stand so: over its support, and by its servos."""
-        if self.mpc.support is None:
+        if self.mpc.problem.support is None:
             return True
         _, com = self.place(qpos)
-        stands = self.mpc.support.compute_excess(qpos[:7], com[:2]).max() <= 0
+        stands = self.mpc.problem.support.compute_excess(qpos[:7], com[:2]).max() <= 0
         return bool(stands and self.load.compute_excess(qpos[None]).max() <= 0)
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
@@ -87,26 +88,16 @@ class Robot:
         """Do for `dt` what is proposed for a goal; returns configuration and command then."""
         config = self.mpc.configs[goal.mode]
         self.mpc.offset.reset(command)  # it rests where it is told to
-        held, served = self.mpc._serve(qpos, command, goal, config)
         head, _ = self.place(qpos)
-        goals, facing = self.mpc._guidance.lead(
-            qpos, command, {"head": head}, held, config, time, served
-        )
-        proposal = self.mpc.candidates.propose(
-            make_state(self, qpos, command),
-            {"head": goals["head"][-1:] if served is None else served.move(goals["head"][-1:])},
-            goal.mode,
-            config,
-            start=command,
-            executed=command,
-            drift=np.zeros(3),
-            facing=facing,
-            served=served,
-        )
+        offset = self.mpc.offset.offset
+        now = PlannerState(qpos, command, np.zeros(3), offset, command, {"head": head}, time)
+        reference = self.mpc.references.lead(now, goal, config)
+        proposal = self.mpc.candidates.propose(now, reference, goal.mode, config, command)
         reach = self.space.compute_max_rate(goal.mode, command) * dt
         proposal = self.space.restrict(proposal, goal.mode)
         following = np.clip(proposal, command - reach, command + reach)
-        qpos = self.command_model.extrapolate(qpos, following, dt, goal.mode, settled=command)
+        start = Start(qpos, settled=command)
+        qpos = self.command_model.extrapolate(start, following, dt, goal.mode)
         return qpos, following
 
     def go(self, command: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -235,7 +226,7 @@ def test_who_turns_beyond_what_a_waist_can_is_not_helped_by_a_tilt(fleet, name):
 
 def test_a_goal_that_turns_past_half_a_turn_stays_on_its_side(fleet):
     """The waist waits at its limit; it goes all the way round once that is much shorter."""
-    guide, robot = fleet["rby1"].mpc._postures, fleet["rby1"]
+    guide, robot = fleet["rby1"].mpc.references.postures, fleet["rby1"]
     guide.reset()
     beyond = [
         guide._compute_turn_beyond(quat_from_yaw(turn), 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -28,7 +29,7 @@ from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.costs import SupportArea
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
-from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel, Start
 from xop_lerobot.retarget.model.heading import linearise_heading
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.model.linearisation import Placement
@@ -59,9 +60,12 @@ class Parts:
         settings.setdefault("base_body", self.morphology.base_body)
         return KinematicProposal(self.model, self.command_model, {"head": self.head}, **settings)
 
+    def solve(self, goals: dict, mode: Mode, dt: float, *, drift=None, **how) -> np.ndarray:
+        return self.proposal.solve(Start(self.qpos, drift=drift), goals, mode, dt, **how).command
+
     def reach(self, command: np.ndarray, mode: Mode, dt: float = DT, drift=None) -> np.ndarray:
         """Where the head of an ideal robot is after `dt` of a command."""
-        future = self.command_model.extrapolate(self.qpos, command, dt, mode, drift)
+        future = self.command_model.extrapolate(Start(self.qpos, drift=drift), command, dt, mode)
         return self.kinematics.compute_poses(future)[self.head]
 
     def draw(self, rng: np.random.Generator, mode: Mode, share: float = 0.3) -> np.ndarray:
@@ -96,7 +100,7 @@ def test_the_base_moves_along_the_arc_of_its_twist(parts):
         x += (0.5 * np.cos(yaw) + 0.2 * np.sin(yaw)) * DT / steps
         y += (0.5 * np.sin(yaw) - 0.2 * np.cos(yaw)) * DT / steps
         yaw += 0.8 * DT / steps
-    got = model.extrapolate(qpos, command, DT, Mode.MOBILE)
+    got = model.extrapolate(Start(qpos), command, DT, Mode.MOBILE)
     np.testing.assert_allclose(got[:2], [x, y], atol=0.005)
     assert quat_yaw(got[3:7]) == pytest.approx(yaw)
 
@@ -111,7 +115,7 @@ def test_a_pivot_ahead_of_the_base_stays_where_it_is(parts):
     def axle(q: np.ndarray) -> np.ndarray:
         return q[:3] + quat_rotate(q[3:7], np.array([rby1.morphology.pivot, 0, 0]))
 
-    got = rby1.command_model.extrapolate(qpos, command, 0.8, Mode.MOBILE)
+    got = rby1.command_model.extrapolate(Start(qpos), command, 0.8, Mode.MOBILE)
     np.testing.assert_allclose(axle(got), axle(qpos), atol=1e-12)
     assert quat_yaw(got[3:7]) == pytest.approx(-0.3)
 
@@ -121,7 +125,7 @@ def test_a_pivot_ahead_of_the_base_stays_where_it_is(parts):
 def test_heights_and_joints_follow_with_their_lag(parts, name, mode):
     p = parts[name]
     command = p.draw(np.random.default_rng(0), mode)
-    got = p.command_model.extrapolate(p.qpos, command, 0.2, mode)
+    got = p.command_model.extrapolate(Start(p.qpos), command, 0.2, mode)
     for i, effect in enumerate(p.morphology.effects):
         if p.command_model.is_velocity()[i] or not p.command_model.acting(mode)[i]:
             continue
@@ -133,7 +137,7 @@ def test_heights_and_joints_follow_with_their_lag(parts, name, mode):
 @robots
 def test_the_neutral_command_leaves_place_and_heading_alone(parts, name):
     p = parts[name]
-    got = p.command_model.extrapolate(p.qpos, p.space.neutral, 2.0, Mode.MOBILE)
+    got = p.command_model.extrapolate(Start(p.qpos), p.space.neutral, 2.0, Mode.MOBILE)
     np.testing.assert_allclose(got[:2], p.qpos[:2], atol=1e-12)
     np.testing.assert_allclose(got[3:7], p.qpos[3:7], atol=1e-12)
 
@@ -143,9 +147,11 @@ def test_the_neutral_command_leaves_place_and_heading_alone(parts, name):
 def test_a_batch_equals_one_at_a_time(parts, name, mode):
     p, rng = parts[name], np.random.default_rng(1)
     commands = np.stack([p.draw(rng, mode) for _ in range(4)])
-    batch = p.command_model.extrapolate(p.qpos, commands, 0.3, mode)
+    batch = p.command_model.extrapolate(Start(p.qpos), commands, 0.3, mode)
     for row, command in zip(batch, commands, strict=True):
-        np.testing.assert_array_equal(row, p.command_model.extrapolate(p.qpos, command, 0.3, mode))
+        np.testing.assert_array_equal(
+            row, p.command_model.extrapolate(Start(p.qpos), command, 0.3, mode)
+        )
 
 
 @robots
@@ -165,9 +171,13 @@ def test_a_sway_shifts_the_base_and_stops(parts):
     settled[4], command[4] = 0.1, 0.2
     gain = p.morphology.effects[4].sway_s
     for dt, share in ((0.3, 1 - np.exp(-1)), (10.0, 1.0)):
-        got = p.command_model.extrapolate(qpos, command, dt, Mode.STATIONARY, settled=settled)
+        got = p.command_model.extrapolate(
+            Start(qpos, settled=settled), command, dt, Mode.STATIONARY
+        )
         np.testing.assert_allclose(got[:2] - qpos[:2], [0, 0.1 * gain * share], atol=1e-5)
-    stays = p.command_model.extrapolate(qpos, settled, 10.0, Mode.STATIONARY, settled=settled)
+    stays = p.command_model.extrapolate(
+        Start(qpos, settled=settled), settled, 10.0, Mode.STATIONARY
+    )
     np.testing.assert_allclose(stays[:2], qpos[:2], atol=1e-12)
 
 
@@ -202,7 +212,7 @@ def test_it_recovers_what_the_goal_was_made_with(parts, name, mode):
         wanted = p.draw(np.random.default_rng(seed), mode)
         goal = p.reach(wanted, mode)
         far = measure_error(p.reach(p.space.neutral, mode), goal)
-        got = p.proposal.solve(p.qpos, {"head": goal}, mode, DT)
+        got = p.solve({"head": goal}, mode, DT)
         near = measure_error(p.reach(got, mode), goal)
         # The effort keeps it a little short of the goal.
         assert near[0] < max(0.1 * far[0], 0.01)
@@ -219,7 +229,7 @@ def test_bounds_hold_and_what_does_not_act_stays_neutral(name, mode, seed, parts
     goal[:3] += rng.uniform(-3, 3, 3)
     goal[3:] = quat_multiply(quat_from_yaw(rng.uniform(-3, 3)), goal[3:])
     start = rng.uniform(p.space.low, p.space.high)
-    got = p.proposal.solve(p.qpos, {"head": goal}, mode, DT, start=start)
+    got = p.solve({"head": goal}, mode, DT, start=start)
     assert (got >= p.space.low).all()
     assert (got <= p.space.high).all()
     rest = ~p.command_model.acting(mode)
@@ -231,7 +241,7 @@ def test_stationary_leaves_the_velocities_neutral(parts, name):
     p = parts[name]
     goal = p.reach(p.space.neutral, Mode.STATIONARY)
     goal[0] += 1.0
-    got = p.proposal.solve(p.qpos, {"head": goal}, Mode.STATIONARY, DT)
+    got = p.solve({"head": goal}, Mode.STATIONARY, DT)
     velocities = p.command_model.is_velocity() & (p.space.sway == 0)
     np.testing.assert_array_equal(got[velocities], p.space.neutral[velocities])
 
@@ -245,7 +255,7 @@ def test_it_beats_random_commands(parts, name, mode):
     effort = p.proposal.weights.effort * np.array([e.effort for e in p.morphology.effects])
 
     def compute_objective(commands: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        future = p.command_model.extrapolate(p.qpos, commands, DT, mode)
+        future = p.command_model.extrapolate(Start(p.qpos), commands, DT, mode)
         poses = p.kinematics.compute_poses(future)[p.head]
         error = np.square(poses[:, :3] - goal[:3]).sum(1)
         error += np.square(0.4 * heading_error(goal[3:], poses[:, 3:])).sum(1)
@@ -254,7 +264,7 @@ def test_it_beats_random_commands(parts, name, mode):
     for _ in range(5):
         goal = p.reach(p.draw(rng, mode, 0.6), mode)
         goal[:3] += rng.uniform(-0.2, 0.2, 3)
-        got = p.proposal.solve(p.qpos, {"head": goal}, mode, DT)
+        got = p.solve({"head": goal}, mode, DT)
         others = np.stack([p.draw(rng, mode, 1.0) for _ in range(500)])
         assert compute_objective(got[None], goal)[0] <= compute_objective(others, goal).min()
 
@@ -266,7 +276,8 @@ def test_more_iterations_do_not_move_it(parts, name, mode):
     p = parts[name]
     goal = p.reach(p.draw(np.random.default_rng(5), mode), mode)
     few, many = (
-        p.make(iterations=count).solve(p.qpos, {"head": goal}, mode, DT) for count in (4, 40)
+        p.make(iterations=count).solve(Start(p.qpos), {"head": goal}, mode, DT).command
+        for count in (4, 40)
     )
     np.testing.assert_allclose(few, many, atol=0.02)
 
@@ -274,7 +285,7 @@ def test_more_iterations_do_not_move_it(parts, name, mode):
 def test_a_known_drift_is_walked_against(parts):
     p, drift = parts["g1"], np.array([-0.1, 0.05, 0.1])
     goal = p.reach(p.space.neutral, Mode.MOBILE)
-    got = p.proposal.solve(p.qpos, {"head": goal}, Mode.MOBILE, DT, drift=drift)
+    got = p.solve({"head": goal}, Mode.MOBILE, DT, drift=drift)
     twist = p.command_model.compute_twist(got)
     np.testing.assert_allclose(twist, -drift, atol=0.03)
 
@@ -286,8 +297,12 @@ def test_the_centre_of_mass_stays_over_the_support_area(parts):
     goal[0] += 0.6  # lean far ahead
 
     def compute_excess(support: SupportArea | None) -> float:
-        got = p.make(support=support).solve(p.qpos, {"head": goal}, Mode.STATIONARY, DT)
-        future = p.command_model.extrapolate(p.qpos, got, DT, Mode.STATIONARY)
+        got = (
+            p.make(support=support)
+            .solve(Start(p.qpos), {"head": goal}, Mode.STATIONARY, DT)
+            .command
+        )
+        future = p.command_model.extrapolate(Start(p.qpos), got, DT, Mode.STATIONARY)
         com = Placement(p.model, (), (), p.morphology.base_body).compute(future[None])[2][0]
         return float(area.compute_excess(future[:7], com[:2]).max())
 
@@ -301,7 +316,7 @@ def test_entries_that_are_not_free_stay_neutral(parts):
     goal[2] -= 0.1
     free = np.zeros(len(p.space), dtype=bool)
     free[p.space.index("height")] = True
-    got = p.proposal.solve(p.qpos, {"head": goal}, Mode.STATIONARY, DT, free=free)
+    got = p.solve({"head": goal}, Mode.STATIONARY, DT, free=free)
     assert got[0] < 0.72
     np.testing.assert_array_equal(got[1:], p.space.neutral[1:])
 
@@ -310,7 +325,7 @@ def test_entries_that_are_not_free_stay_neutral(parts):
 def test_without_goals_it_is_where_it_starts(parts, name):
     p = parts[name]
     start = p.draw(np.random.default_rng(0), Mode.MOBILE)
-    np.testing.assert_array_equal(p.proposal.solve(p.qpos, {}, Mode.MOBILE, DT, start=start), start)
+    np.testing.assert_array_equal(p.solve({}, Mode.MOBILE, DT, start=start), start)
 
 
 def test_a_dear_entry_is_used_less(parts):
@@ -318,9 +333,9 @@ def test_a_dear_entry_is_used_less(parts):
     goal = p.reach(p.space.neutral, Mode.STATIONARY)
     goal[0] += 0.1
     cheap, dear = (
-        p.make(weights=ProposalWeights(effort=effort)).solve(
-            p.qpos, {"head": goal}, Mode.STATIONARY, DT
-        )
+        p.make(weights=ProposalWeights(effort=effort))
+        .solve(Start(p.qpos), {"head": goal}, Mode.STATIONARY, DT)
+        .command
         for effort in (0.01, 1.0)
     )
     assert np.abs(dear - p.space.neutral)[3:5].max() < np.abs(cheap - p.space.neutral)[3:5].max()
@@ -339,13 +354,13 @@ def test_the_command_models_derivative_equals_finite_differences(parts, name, mo
     command, drift = p.draw(rng, mode), np.array([0.05, -0.1, 0.2])
     executed = command + 0.1 * p.space.max_rate * DT * rng.normal(size=len(p.space))
     offset, settled = 0.02 * rng.normal(size=(2, len(p.space)))
-    arguments = (DT, mode, drift, executed if ramped else None, offset, settled)
-    future, got = p.command_model.linearise(qpos, command, *arguments)
-    batch = p.command_model.extrapolate(qpos[None], command[None], *arguments)
+    start = Start(qpos, executed if ramped else None, drift, offset, settled)
+    future, got = p.command_model.linearise(start, command, DT, mode)
+    batch = p.command_model.extrapolate(replace(start, qpos=qpos[None]), command[None], DT, mode)
     np.testing.assert_allclose(future, batch[0], atol=1e-12)
     for i, step in enumerate(1e-6 * np.eye(len(command))):
         ahead, behind = (
-            p.command_model.extrapolate(qpos, command + sign * step, *arguments) for sign in (1, -1)
+            p.command_model.extrapolate(start, command + sign * step, DT, mode) for sign in (1, -1)
         )
         tangent = np.empty(p.model.nv)
         mujoco.mj_differentiatePos(p.model, tangent, 2e-6, behind, ahead)
@@ -377,7 +392,7 @@ def test_the_residuals_derivative_equals_finite_differences(parts, name, mode):
 
     def linearise(command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         wanted = np.array([0.4, 0.3])
-        return proposal.linearise(qpos, command, goals, mode, DT, facing=wanted)
+        return proposal.linearise(Start(qpos), command, goals, mode, DT, facing=wanted)
 
     _, got = linearise(command)
     steps = 1e-6 * np.eye(len(command))
@@ -414,8 +429,8 @@ def test_at_the_solution_no_free_entry_can_do_better(parts, name, mode):
         goal = p.reach(p.draw(rng, mode, 0.5), mode)
         goal[:2] += share * rng.uniform(-0.5, 0.5, 2)
         proposal = p.make(iterations=60)
-        got = proposal.solve(p.qpos, {"head": goal}, mode, DT)
-        residual, jacobian = proposal.linearise(p.qpos, got, {"head": goal}, mode, DT)
+        got = proposal.solve(Start(p.qpos), {"head": goal}, mode, DT).command
+        residual, jacobian = proposal.linearise(Start(p.qpos), got, {"head": goal}, mode, DT)
         effort = proposal.weights.effort * np.array([e.effort for e in p.morphology.effects])
         scaled = (got - p.space.neutral) / proposal.scale
         gradient = proposal.scale * (jacobian.T @ residual) + effort**2 * scaled

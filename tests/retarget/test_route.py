@@ -20,6 +20,7 @@ from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.guidance.guidance import Guidance, compute_times
 from xop_lerobot.retarget.guidance.route import Footprint, RoutePlanner
+from xop_lerobot.retarget.model.command_model import PlannerState
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle
@@ -165,20 +166,26 @@ def make_retargeter(bench_robot):
     return MpcRetargeter(bench_robot, policy, build_model(bench_robot, "planning"))
 
 
+def make_planner_state(retargeter: MpcRetargeter, qpos, poses) -> PlannerState:
+    """At rest under the neutral command."""
+    none = np.zeros(len(retargeter.space))
+    neutral = retargeter.space.neutral
+    return PlannerState(qpos, neutral, np.zeros(3), none, neutral, poses, time=0.0)
+
+
 @pytest.mark.parametrize("name, led", [("rby1", True), ("g1", False)])
 def test_who_is_led_along_a_way(name, led):
     """Wheels in mobile mode, to goals that stand; legs and moving goals keep theirs in reach."""
     robot = make_morphology(name)
     retargeter = make_retargeter(robot)
-    guidance: Guidance = retargeter._guidance
+    guidance: Guidance = retargeter.references.guidance
     qpos = robot.standing_qpos()
-    head = retargeter.readings.compute_poses(qpos, retargeter.sites)["head"]
+    head = retargeter.problem.readings.compute_poses(qpos, retargeter.references.sites)["head"]
     target = head + [0, 1, 0, 0, 0, 0, 0]
     config = retargeter.configs[Mode.MOBILE]
-    executed = retargeter.space.neutral
 
     def lead(goal):
-        return guidance.lead(qpos, executed, {"head": head}, goal, config, time=0.0)
+        return guidance.lead(make_planner_state(retargeter, qpos, {"head": head}), goal, config)
 
     goals, facing = lead(Goal({"head": target}, mode=Mode.MOBILE))
     assert goals["head"].shape == (len(compute_times(config)), 7)
@@ -199,15 +206,14 @@ def test_a_base_that_may_not_be_moved_has_no_way():
     retargeter = make_retargeter(robot)
     retargeter.configure(targets=("left_wrist",), body=robot.variants["v2"].body)
     qpos = robot.standing_qpos()
-    hand = retargeter.readings.compute_poses(qpos, retargeter.sites)["left_wrist"]
+    hand = retargeter.problem.readings.compute_poses(qpos, retargeter.references.sites)[
+        "left_wrist"
+    ]
     target = hand + [0, 0.3, 0, 0, 0, 0, 0]
-    goals, facing = retargeter._guidance.lead(
-        qpos,
-        retargeter.space.neutral,
-        {"left_wrist": hand},
+    goals, facing = retargeter.references.guidance.lead(
+        make_planner_state(retargeter, qpos, {"left_wrist": hand}),
         Goal({"left_wrist": target}, mode=Mode.MOBILE),
         retargeter.configs[Mode.MOBILE],
-        time=0.0,
     )
     np.testing.assert_allclose(goals["left_wrist"][:, 1], target[1])
     assert not facing.any()

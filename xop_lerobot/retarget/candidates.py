@@ -19,10 +19,9 @@ from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.costs.balance import SupportArea
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
-from xop_lerobot.retarget.model.command_model import CommandModel
-from xop_lerobot.retarget.model.observers import OffsetObserver
+from xop_lerobot.retarget.model.command_model import CommandModel, PlannerState
 from xop_lerobot.retarget.model.proposal import KinematicProposal, make_proposal_weights, pace
-from xop_lerobot.retarget.posture_guide import Served
+from xop_lerobot.retarget.references import Reference
 from xop_lerobot.retarget.static_load import StaticLoad
 
 
@@ -34,7 +33,6 @@ class Candidates:
         model: Its planning model.
         decision: What is decided.
         command_model: What a decision does.
-        offset: Where the robot rests beside its command.
         support: Area over which the centre of mass stays, None for a robot that balances itself.
         load: What joints bear of the weight above them, None where that does not count.
 
@@ -48,13 +46,12 @@ class Candidates:
         model: mujoco.MjModel,
         decision: DecisionSpace,
         command_model: CommandModel,
-        offset: OffsetObserver,
         support: SupportArea | None,
         load: StaticLoad | None = None,
     ) -> None:
         self._morphology, self._model = morphology, model
         self._support, self._load = support, load
-        self._decision, self._command_model, self._offset = decision, command_model, offset
+        self._decision, self._command_model = decision, command_model
         self._direct: DirectRetargeter | None = None
         self.proposals: dict[Mode, KinematicProposal] = {}
 
@@ -81,33 +78,25 @@ class Candidates:
 
     def propose(
         self,
-        state: RobotState,
-        then: Mapping[str, np.ndarray],
+        state: PlannerState,
+        reference: Reference,
         mode: Mode,
         config: MpcConfig,
-        *,
         start: np.ndarray,
-        executed: np.ndarray,
-        drift: np.ndarray,
-        facing: np.ndarray,
-        served: Served | None = None,
     ) -> np.ndarray:
         """Compute the kinematic proposal, or the executed command where it is not asked for.
 
         Args:
-            state: The robot now.
-            then: Goal of each target in `config.proposal_s`. Shapes (1, 7).
+            state: Where the robot is, with the decision that it executes.
+            reference: What is to be followed; the last of its goals are those of the proposal.
             mode: Mode of the robot.
             config: Parameters of the mode.
             start: Decision from which the iteration starts. Shape (n,).
-            executed: Decision being executed. Shape (n,).
-            drift: Drift of the base. Shape (3,).
-            facing: Where a base on wheels shall face. Shape (2,).
-            served: The posture for the head's goal, None where there is none.
 
         Returns:
             Decision. Shape (n,).
         """
+        executed, served = state.executed, reference.served
         if "proposal" not in config.candidates and config.control_reference != "proposal":
             return executed
         natural, free = None, None
@@ -117,33 +106,29 @@ class Candidates:
                 reach = self._decision.space.compute_max_rate(mode, executed) * config.proposal_s
                 natural = start = pace(executed, natural, reach)
                 free = self._command_model.acting(mode) & self._command_model.is_velocity()
-        proposal = self.proposals[mode].solve(
-            state.qpos,
-            {name: poses[0] for name, poses in then.items()},
+        solution = self.proposals[mode].solve(
+            state.start,
+            {name: track[-1] for name, track in reference.goals.items()},
             mode,
             config.proposal_s,
             start=start,
-            drift=drift,
-            executed=executed,
-            offset=self._offset.offset,
-            settled=self._offset.settled,
-            facing=facing,
+            facing=reference.facing,
             free=free,
             natural=natural,
-            balance=None if served is None else served.balance,
+            balance=reference.balance,
         )
-        return proposal if np.isfinite(proposal).all() else executed
+        return solution.command if np.isfinite(solution.command).all() else executed
 
     def collect(
         self,
         state: RobotState,
         goal: Goal,
-        executed: np.ndarray,
+        now: PlannerState,
         proposal: np.ndarray,
         config: MpcConfig,
     ) -> np.ndarray:
         """All fixed decisions to try, in the order of `config.candidates`. Shape (c, n)."""
-        candidates = []
+        candidates, executed = [], now.executed
         space = self._decision.space
         for name in config.candidates:
             if name == "proposal":

@@ -19,7 +19,7 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import Morphology
-from xop_lerobot.retarget.model.command_model import CommandModel, find_joints_along
+from xop_lerobot.retarget.model.command_model import CommandModel, Start, find_joints_along
 from xop_lerobot.retarget.model.proposal import KinematicProposal, ProposalWeights
 from xop_lerobot.retarget.plan import Plan, Retargeter
 
@@ -73,13 +73,13 @@ class DirectRetargeter(Retargeter):
         if "head" in goal.poses:
             # Long enough for the lags to die out: the mapping is static.
             command = self.proposal.solve(
-                state.qpos,
+                Start(state.qpos),
                 {"head": self._turn_to_base(state, goal)},
                 goal.mode,
                 dt=2.0,
                 start=self._last,
                 free=self.command_model.acting(goal.mode) & ~velocities,
-            )
+            ).command
         command = np.where(velocities, self._map_velocity(state, goal), command)
         command = self.space.leave_dead_zones(command, goal.mode)
         command = np.clip(command, *self.space.bounds(goal.mode))

@@ -26,7 +26,12 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.costs.balance import SupportArea
-from xop_lerobot.retarget.model.command_model import CommandModel, find_joints_along
+from xop_lerobot.retarget.model.command_model import (
+    CommandModel,
+    PlannerState,
+    Start,
+    find_joints_along,
+)
 from xop_lerobot.retarget.model.linearisation import Placement
 from xop_lerobot.retarget.model.posture import AT_REST_S, MISSED, Found, PostureSearch, Repertoire
 from xop_lerobot.retarget.model.proposal import KinematicProposal, make_proposal_weights
@@ -90,6 +95,7 @@ class PostureGuide:
         model: Its planning model.
         command_model: What a decision does.
         support: Area over which the centre of mass stays; None for a robot that balances itself.
+        load: What joints bear of the weight above them; None where a policy moves them.
     """
 
     def __init__(
@@ -98,22 +104,23 @@ class PostureGuide:
         model: mujoco.MjModel,
         command_model: CommandModel,
         support: SupportArea | None,
+        load: StaticLoad | None,
     ) -> None:
         self._morphology, self._model, self._command_model = morphology, model, command_model
         self._support = support
-        self.load = make_static_load(morphology, model)
+        self._load = load
         self._site = morphology.frames[HEAD]
         base = morphology.base_body
         self._placement = Placement(model, (self._site,), com_of=base)
         standing = morphology.standing_qpos()
         self._repertoire = Repertoire(
-            model, command_model, standing, self._site, base, support, self.load
+            model, command_model, standing, self._site, base, support, self._load
         )
         roll, _, self._vertical = (
             find_joints_along(morphology, model, command_model, axis) for axis in range(3)
         )
         self._aside = roll | self._vertical
-        self._resting = self._place(standing, command_model.space.neutral)[0][:2]
+        self._resting = self._place(Start(standing), command_model.space.neutral)[0][:2]
         space = command_model.space
         low, high = space.low.copy(), space.high.copy()
         for name, (least, most) in morphology.posture_limits.items():
@@ -172,7 +179,7 @@ class PostureGuide:
             weights,
             self._support,
             self._morphology.base_body,
-            self.load,
+            self._load,
         )
         return PostureSearch(
             problem, self._repertoire, used, self._limits, strict=level, looks_at_way=way
@@ -188,23 +195,12 @@ class PostureGuide:
     def _start(self) -> None:
         self._beside, self._reach, self._waited = 0.0, self._morphology.standing_reach, 0
 
-    def hold(
-        self,
-        goal: Goal,
-        qpos: np.ndarray,
-        executed: np.ndarray,
-        offset: np.ndarray,
-        settled: np.ndarray,
-        preview_s: float,
-    ) -> Goal:
+    def hold(self, goal: Goal, state: PlannerState, preview_s: float) -> Goal:
         """Hold the goal of a robot that stands near the place where its head rests.
 
         Args:
             goal: The goal.
-            qpos: Configuration now. Shape (nq,).
-            executed: Decision executed now. Shape (n,).
-            offset: As for `CommandModel.extrapolate`. Shape (n,).
-            settled: As for `CommandModel.extrapolate`. Shape (n,).
+            state: Where the robot is.
             preview_s: Time over which it is assumed to keep its velocity [s].
         """
         if (
@@ -215,7 +211,7 @@ class PostureGuide:
         ):
             return goal
         pose = goal.poses[HEAD].copy()
-        arguments = (executed, offset, settled)
+        qpos = state.qpos
         heading = float(quat_yaw(qpos[3:7]))
         ahead = np.array([math.cos(heading), math.sin(heading)])
         axes = np.stack([ahead, [-ahead[1], ahead[0]]])
@@ -227,15 +223,15 @@ class PostureGuide:
         is_far = far > self._morphology.standing_reach
         reachable = False
         if beyond or is_far:
-            reachable = self._free.find(HEAD, qpos, pose, *arguments).missed <= MISSED
+            reachable = self._free.find(HEAD, state, pose).missed <= MISSED
         if beyond and not reachable:  # a tilted head may look further aside than the waist turns
             pose[3:] = quat_multiply(quat_from_yaw(-beyond), pose[3:])
-            reachable = self._free.find(HEAD, qpos, pose, *arguments).missed <= MISSED
+            reachable = self._free.find(HEAD, state, pose).missed <= MISSED
         self._adapt_reach(reachable and is_far, moving=_is_moving(goal))
         if is_far:
             # Who bows or squats has the head elsewhere; up to there it is no matter of reach.
-            found = self._level.find(HEAD, qpos, pose, *arguments)
-            bowed, _ = self._place(qpos, found.command, offset, settled)
+            found = self._level.find(HEAD, state, pose)
+            bowed, _ = self._place(state.start, found.command)
             bowed = axes @ (bowed[:2] - qpos[:2])
             place, end = (
                 _hold_near_line(each, self._resting, bowed, self._reach) for each in (place, end)
@@ -278,49 +274,37 @@ class PostureGuide:
         waist = self._vertical & self._command_model.acting(Mode.STATIONARY)
         return beside - min(max(beside, space.low[waist].sum()), space.high[waist].sum())
 
-    def find(
-        self,
-        goal: Goal,
-        pose: np.ndarray,
-        qpos: np.ndarray,
-        executed: np.ndarray,
-        offset: np.ndarray,
-        settled: np.ndarray,
-    ) -> Served | None:
+    def find(self, goal: Goal, pose: np.ndarray, state: PlannerState) -> Served | None:
         """Find the posture for the head at `pose`; None where the mode knows none.
 
-        Args: as for `hold`; `pose` is the goal of the head that counts. Shape (7,).
+        Args:
+            goal: The goal.
+            pose: That of the head that counts. Shape (7,).
+            state: Where the robot is.
         """
         search = self._searches.get(goal.mode)
         if search is None:
             return None
-        if goal.mode is Mode.STATIONARY and self._is_braking(executed):
-            stop = np.where(self._command_model.is_velocity(), 0.0, executed)
+        if goal.mode is Mode.STATIONARY and self._is_braking(state.executed):
+            stop = np.where(self._command_model.is_velocity(), 0.0, state.executed)
             still = Found(stop, 0.0, detour=True)
-            there, _ = self._place(qpos, stop, offset, settled)
-            served = self._describe(still, goal.mode, there, qpos, offset, settled)
+            there, _ = self._place(state.start, stop)
+            served = self._describe(still, goal.mode, there, state)
             return served._replace(brakes=True)
         if goal.mode is Mode.MOBILE:
             pose = _remove_roll(pose)
-        found = search.find(HEAD, qpos, pose, executed, offset, settled)
+        found = search.find(HEAD, state, pose)
         if not np.isfinite(found.command).all():
             search.reset()
             return None
         # On the way, to be in the posture for the goal of now takes more torque than to follow it.
-        if goal.mode is Mode.MOBILE and not self._is_stuck(goal, qpos):
+        if goal.mode is Mode.MOBILE and not self._is_stuck(goal, state.qpos):
             return None
-        return self._describe(found, goal.mode, pose, qpos, offset, settled)
+        return self._describe(found, goal.mode, pose, state)
 
-    def _describe(
-        self,
-        found: Found,
-        mode: Mode,
-        pose: np.ndarray,
-        qpos: np.ndarray,
-        offset: np.ndarray,
-        settled: np.ndarray,
-    ) -> Served:
-        there, com = self._place(qpos, found.command, offset, settled)
+    def _describe(self, found: Found, mode: Mode, pose: np.ndarray, state: PlannerState) -> Served:
+        qpos = state.qpos
+        there, com = self._place(state.start, found.command)
         heading = float(quat_yaw(qpos[3:7]))
         cosine, sine = math.cos(heading), math.sin(heading)
         to_base = np.array([[cosine, sine], [-sine, cosine]])
@@ -336,27 +320,13 @@ class PostureGuide:
             detour=found.detour,
         )
 
-    def _place(
-        self,
-        qpos: np.ndarray,
-        command: np.ndarray,
-        offset: np.ndarray | None = None,
-        settled: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _place(self, start: Start, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose of the head (7,) and centre of mass (3,) of a robot at rest under a command."""
         future = self._command_model.extrapolate(
-            qpos, command, AT_REST_S, Mode.STATIONARY, offset=offset, settled=settled
+            start.without_ramp(), command, AT_REST_S, Mode.STATIONARY
         )
         poses, _, com = self._placement.compute(future[None])
         return poses[self._site][0], com[0]
-
-
-def make_static_load(morphology: Morphology, model: mujoco.MjModel) -> StaticLoad | None:
-    """What the servos of a stiff body bear; None where a policy moves the body."""
-    if not morphology.has_stiff_body:
-        return None
-    joints = [effect.joint for effect in morphology.effects if effect.joint]
-    return StaticLoad(model, joints, morphology.load_share)
 
 
 def _is_moving(goal: Goal) -> bool:

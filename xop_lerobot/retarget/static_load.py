@@ -7,6 +7,8 @@ from collections.abc import Iterable
 import mujoco
 import numpy as np
 
+from xop_lerobot.morphology.morphology import Morphology
+
 
 class StaticLoad:
     r"""Torque that holds joints against gravity alone, over the limits of their motors.
@@ -99,6 +101,14 @@ def _cross_level(a: np.ndarray, b: np.ndarray) -> np.ndarray:
             a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
         ]
     )
+
+
+def make_static_load(morphology: Morphology, model: mujoco.MjModel) -> StaticLoad | None:
+    """What the servos of a stiff body bear; None where a policy moves the body."""
+    if not morphology.has_stiff_body:
+        return None
+    joints = [effect.joint for effect in morphology.effects if effect.joint]
+    return StaticLoad(model, joints, morphology.load_share)
 
 
 def _find_limits(model: mujoco.MjModel) -> dict[int, float]:

@@ -23,7 +23,7 @@ from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.costs.balance import compute_facing
 from xop_lerobot.retarget.guidance.route import Footprint, RoutePlanner
 from xop_lerobot.retarget.horizon_goals import hold_near, preview
-from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel, PlannerState
 from xop_lerobot.retarget.posture_guide import HEAD, Served
 
 
@@ -41,8 +41,7 @@ class FacingRule:
 
     def compute(
         self,
-        qpos: np.ndarray,
-        poses: Mapping[str, np.ndarray],
+        state: PlannerState,
         then: Mapping[str, np.ndarray],
         dt: float,
         room: float = math.inf,
@@ -51,9 +50,8 @@ class FacingRule:
         """Compute where the base shall face. A hand looks nowhere: for it, as it faces now.
 
         Args:
-            qpos: Configuration now. Shape (nq,).
-            poses: Pose of each tracked frame now. Shapes (7,).
-            then: Its goal in `dt`. Shapes (1, 7).
+            state: Where the robot is.
+            then: Goal of each tracked frame in `dt`. Shapes (1, 7).
             dt: Time to get there [s].
             room: How far the arms let the waist twist [rad].
             ahead: How far ahead of the base frames will be, where not as at rest [m].
@@ -61,9 +59,10 @@ class FacingRule:
         Returns:
             Direction in the world, as long as it counts. Shape (2,).
         """
-        heading, pivot = float(quat_yaw(qpos[3:7])), self._pivot
+        qpos, pivot = state.qpos, self._pivot
+        heading = float(quat_yaw(qpos[3:7]))
         for name, goals in then.items():
-            missing = goals[0, :2] - poses[name][:2]
+            missing = goals[0, :2] - state.poses[name][:2]
             velocity, look = missing / dt, heading
             if name not in self._hands:
                 look = float(compute_heading(goals[0, 3:]))
@@ -218,45 +217,38 @@ class Guidance:
 
     def lead(
         self,
-        qpos: np.ndarray,
-        executed: np.ndarray,
-        poses: Mapping[str, np.ndarray],
+        state: PlannerState,
         goal: Goal,
         config: MpcConfig,
-        time: float,
         served: Served | None = None,
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Compute the goals at `compute_times`, and where a base on wheels shall face at the end.
 
         Args:
-            qpos: Configuration now. Shape (nq,).
-            executed: Decision being executed. Shape (n,).
-            poses: Pose of each tracked frame now. Shapes (7,).
+            state: Where the robot is, with the decision that it executes.
             goal: The goal now.
             config: Parameters of the mode.
-            time: Time of `qpos` [s].
             served: The posture for the head's goal, None where there is none.
 
         Returns:
             Poses, shapes (H + 3, 7), and a direction in the world, as long as it counts: zero
             where none does. Shape (2,).
         """
-        times = compute_times(config)
+        times, poses = compute_times(config), state.poses
         ahead = {} if served is None else {HEAD: served.ahead}
         name = next((name for name in poses if name in goal.poses), None)
         drives = name is not None and self._drives(goal.mode)
-        room = self._room.compute(qpos, time) if drives and self._room is not None else math.inf
+        room = math.inf
+        if drives and self._room is not None:
+            room = self._room.compute(state.qpos, state.time)
         if name is not None and drives and _compute_speed(goal, name) < _STILL:
-            twist = self._command_model.compute_twist(executed)
-            return self._lead_along_route(
-                qpos, twist, poses, goal, name, times, config, room, ahead
-            )
+            return self._lead_along_route(state, goal, name, times, config, room, ahead)
         near = hold_near(goal, poses, config.reach)
         goals = preview(near, tuple(poses), times, config.preview_s)
         if not drives:
             return goals, np.zeros(2)
         then = {each: track[-1:] for each, track in goals.items()}
-        return goals, self._facing.compute(qpos, poses, then, config.proposal_s, room, ahead)
+        return goals, self._facing.compute(state, then, config.proposal_s, room, ahead)
 
     def _drives(self, mode: Mode) -> bool:
         """Whether wheels are among what may be moved in `mode`."""
@@ -267,9 +259,7 @@ class Guidance:
 
     def _lead_along_route(
         self,
-        qpos: np.ndarray,
-        twist: np.ndarray,
-        poses: Mapping[str, np.ndarray],
+        state: PlannerState,
         goal: Goal,
         name: str,
         times: np.ndarray,
@@ -279,8 +269,10 @@ class Guidance:
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Goals where the base will have carried the frame `name`; the others go with it."""
         assert self._routes is not None
+        poses = state.poses
+        twist = self._command_model.compute_twist(state.executed)
         route = self._routes.plan(
-            qpos,
+            state.qpos,
             (float(twist[0]), float(twist[2])),
             name,
             poses[name],

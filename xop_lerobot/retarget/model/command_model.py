@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 
 import mujoco
@@ -23,6 +25,63 @@ from xop_lerobot.morphology.morphology import Morphology
 _TWIST = (Acts.FORWARD, Acts.LEFT, Acts.TURN)
 _TURN = 2
 _ALONG = 0.99  # cosine of the angle within which a joint turns about an axis
+
+
+@dataclass(frozen=True)
+class Start:
+    """What an extrapolation starts from: a configuration, and how the robot follows its command.
+
+    Leading dimensions make a batch.
+
+    Attributes:
+        qpos: Configuration. Shape (..., nq).
+        executed: Command executed now, from which the robot ramps at its rate limits to the next
+            one; None where it takes a command up at once. Shape (..., k).
+        drift: Base velocity beyond the commanded one: along, across [m/s], yaw rate [rad/s]; none
+            by default. Shape (3,).
+        offset: Where heights and joints come to rest beside their command; none by default.
+            Shape (k,).
+        settled: The executed command after the robot's lags, under which its base has come to be
+            where it is; neutral by default. Shape (..., k).
+    """
+
+    qpos: np.ndarray
+    executed: np.ndarray | None = None
+    drift: np.ndarray | None = None
+    offset: np.ndarray | None = None
+    settled: np.ndarray | None = None
+
+    def without_ramp(self) -> Start:
+        """The same for a command that is taken up at once, given all the time to do so."""
+        return Start(self.qpos, drift=self.drift, offset=self.offset, settled=self.settled)
+
+
+@dataclass(frozen=True)
+class PlannerState:
+    """All that the parts of a planner know of the robot.
+
+    Attributes:
+        qpos: Configuration. Shape (nq,).
+        executed: Decision that is executed now. Shape (n,).
+        drift: As in `Start`. Shape (3,).
+        offset: As in `Start`. Shape (n,).
+        settled: As in `Start`. Shape (n,).
+        poses: Pose of each tracked frame. Shapes (7,).
+        time: The robot's clock [s].
+    """
+
+    qpos: np.ndarray
+    executed: np.ndarray
+    drift: np.ndarray
+    offset: np.ndarray
+    settled: np.ndarray
+    poses: Mapping[str, np.ndarray]
+    time: float
+
+    @cached_property
+    def start(self) -> Start:
+        """What extrapolations start from."""
+        return Start(self.qpos, self.executed, self.drift, self.offset, self.settled)
 
 
 class CommandModel:
@@ -104,6 +163,15 @@ class CommandModel:
     def acting(self, mode: Mode) -> np.ndarray:
         """Which free entries have an effect in `mode`. Shape (k,), bool."""
         return self._acting[mode]
+
+    def hold(self, decisions: np.ndarray, executed: np.ndarray, mode: Mode) -> np.ndarray:
+        """Decisions, with the entries that are not free: no velocity, the rest as executed.
+
+        Shapes (..., k), (k,) -> (..., k).
+        """
+        stays = ~self.body & ~self._is_velocity
+        held = np.where(stays, executed, self.space.neutral)
+        return np.where(self.acting(mode), decisions, held)
 
     def _compute_share(self, dt: float) -> np.ndarray:
         """Share of a change that height and joints have made after `dt`. Shape (k,)."""
@@ -191,46 +259,31 @@ class CommandModel:
         slope = np.where(self._is_velocity, 1 - ramp, 1.0) * inside
         return executed + np.where(self._is_velocity, mean, reached), slope
 
-    def extrapolate(
-        self,
-        qpos: np.ndarray,
-        command: np.ndarray,
-        dt: float,
-        mode: Mode,
-        drift: np.ndarray | None = None,
-        executed: np.ndarray | None = None,
-        offset: np.ndarray | None = None,
-        settled: np.ndarray | None = None,
-    ) -> np.ndarray:
+    def extrapolate(self, start: Start, command: np.ndarray, dt: float, mode: Mode) -> np.ndarray:
         """Compute the configuration after `dt` of a command.
 
         Args:
-            qpos: Configurations now. Shape (..., nq).
+            start: Where the robot is.
             command: Commands that are held. Shape (..., k).
             dt: How long [s].
             mode: Mode of the robot; only what acts in it has an effect.
-            drift: Base velocity beyond the commanded one, as `compute_twist`. Shape (3,).
-            executed: Command executed now, from which the robot ramps at its rate limits to
-                `command`; None where the command is executed already. Shape (..., k).
-            offset: Where heights and joints come to rest beside their command. Shape (k,).
-            settled: Command under which the base has come to stand where it is, from which it
-                sways; neutral by default. Shape (..., k).
 
         Returns:
             Configurations then. Shape (..., nq).
         """
+        qpos, offset = start.qpos, start.offset
         shape = command.shape[:-1]
         if qpos.ndim > 1:
             shape = np.broadcast_shapes(qpos.shape[:-1], shape)
-        if executed is not None:
-            command, _ = self._ramp(command, executed, dt, mode)
+        if start.executed is not None:
+            command, _ = self._ramp(command, start.executed, dt, mode)
         result = np.broadcast_to(qpos, (*shape, qpos.shape[-1])).copy()
         index = self._following[mode]
         share, address = self._compute_share(dt)[index], self._address[index]
         target = command[..., index] if offset is None else command[..., index] + offset[index]
         result[..., address] += share * (target - result[..., address])
         if mode is Mode.STATIONARY:
-            settled = self.space.neutral if settled is None else settled
+            settled = self.space.neutral if start.settled is None else start.settled
             if self._leans:
                 self._lean_base(result, command, settled, dt)
             if self._moves_base[mode]:
@@ -238,7 +291,7 @@ class CommandModel:
             return result
         if not self._moves_base[mode]:
             return result
-        twist = self.compute_twist(command) + (0 if drift is None else drift)
+        twist = self.compute_twist(command) + (0 if start.drift is None else start.drift)
         forward, left, turn = twist[..., 0], twist[..., 1], twist[..., 2]
         yaw = quat_yaw(result[..., 3:7])
         middle = yaw + turn * dt / 2  # heading halfway: the chord of the arc
@@ -287,15 +340,7 @@ class CommandModel:
         qpos[..., 1] += shift[..., 0] * y + shift[..., 1] * x
 
     def linearise(
-        self,
-        qpos: np.ndarray,
-        command: np.ndarray,
-        dt: float,
-        mode: Mode,
-        drift: np.ndarray | None = None,
-        executed: np.ndarray | None = None,
-        offset: np.ndarray | None = None,
-        settled: np.ndarray | None = None,
+        self, start: Start, command: np.ndarray, dt: float, mode: Mode
     ) -> tuple[np.ndarray, np.ndarray]:
         r"""Compute one extrapolation and :math:`\partial\phi_\tau(q, a)/\partial a`.
 
@@ -307,9 +352,9 @@ class CommandModel:
             Configuration then, shape (nq,), and its derivative, shape (nv, k), zero for entries
             that do not act.
         """
-        slope = np.ones(len(command))
-        if executed is not None:
-            command, slope = self._ramp(command, executed, dt, mode)
+        qpos, offset, slope = start.qpos, start.offset, np.ones(len(command))
+        if start.executed is not None:
+            command, slope = self._ramp(command, start.executed, dt, mode)
         index, share = self._following[mode], self._compute_share(dt)
         future, jacobian = np.array(qpos), np.zeros((self._nv, len(command)))
         address, gain = self._address[index], share[index]
@@ -321,12 +366,12 @@ class CommandModel:
             w, x, y, z = (float(value) for value in qpos[3:7])
             yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
             if stands:
-                settled = self.space.neutral if settled is None else settled
+                settled = self.space.neutral if start.settled is None else start.settled
                 if self._leans:
                     self._linearise_lean(future, jacobian, command, settled, slope, share, yaw)
                 self._linearise_sway(future, jacobian, command - settled, slope, share, yaw)
             else:
-                twist = self.compute_twist(command) + (0 if drift is None else drift)
+                twist = self.compute_twist(command) + (0 if start.drift is None else start.drift)
                 self._linearise_drive(future, jacobian, twist, slope, yaw, dt)
         return future, jacobian
 

@@ -20,7 +20,7 @@ from xop_lerobot.core.transforms import (
     sum_squares,
 )
 from xop_lerobot.retarget.costs.balance import SupportArea
-from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel, PlannerState, Start
 from xop_lerobot.retarget.model.linearisation import Placement
 from xop_lerobot.retarget.model.proposal import KinematicProposal, ProposalWeights, Solution
 from xop_lerobot.retarget.static_load import StaticLoad
@@ -86,7 +86,7 @@ class Repertoire:
         moves = command_model.acting(Mode.STATIONARY) & ~command_model.is_velocity()
         drawn = rng.uniform(space.low, space.high, (_COUNT, len(space)))
         commands = np.where(moves, drawn, space.neutral)
-        qpos = command_model.extrapolate(standing, commands, AT_REST_S, Mode.STATIONARY)
+        qpos = command_model.extrapolate(Start(standing), commands, AT_REST_S, Mode.STATIONARY)
         placement = Placement(model, (site,), com_of=base_body)
         poses, _, com = placement.compute(qpos)
         held = np.ones(_COUNT, dtype=bool)
@@ -164,25 +164,16 @@ class PostureSearch:
         self._beyond = self._detours = False
         self._left, self._waited = np.inf, 0
 
-    def find(
-        self,
-        name: str,
-        qpos: np.ndarray,
-        goal: np.ndarray,
-        executed: np.ndarray,
-        offset: np.ndarray,
-        settled: np.ndarray,
-    ) -> Found:
+    def find(self, name: str, state: PlannerState, goal: np.ndarray) -> Found:
         """Find the posture for a goal.
 
         Args:
             name: The tracked frame.
-            qpos: Configuration now. Shape (nq,).
+            state: Where the robot is, with the command that it executes.
             goal: Its goal. Shape (7,).
-            executed: Command executed now. Shape (k,).
-            offset: As for `CommandModel.extrapolate`. Shape (k,).
-            settled: As for `CommandModel.extrapolate`. Shape (k,).
         """
+        qpos, executed = state.qpos, state.executed
+        at_once = state.start.without_ramp()
         free = self._used & self.problem.command_model.acting(Mode.STATIONARY)
         moved = self._note(qpos, goal)
         apart = self._compute_apart(executed)
@@ -199,15 +190,13 @@ class PostureSearch:
         def solve(
             start: np.ndarray, iterations: int, bounds: tuple[np.ndarray, np.ndarray]
         ) -> Solution:
-            return self.problem.solve_from(
-                qpos,
+            return self.problem.solve(
+                at_once,
                 {name: goal},
                 Mode.STATIONARY,
                 AT_REST_S,
                 start=start,
                 free=free,
-                offset=offset,
-                settled=settled,
                 bounds=bounds,
                 iterations=iterations,
             )

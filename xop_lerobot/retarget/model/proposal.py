@@ -15,7 +15,7 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import quat_rotate, quat_yaw
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs.balance import SupportArea, compute_lateral
-from xop_lerobot.retarget.model.command_model import CommandModel
+from xop_lerobot.retarget.model.command_model import CommandModel, Start
 from xop_lerobot.retarget.model.heading import linearise_heading
 from xop_lerobot.retarget.model.linearisation import Linearisation, find_site
 from xop_lerobot.retarget.static_load import StaticLoad
@@ -133,71 +133,12 @@ class KinematicProposal:
 
     def solve(
         self,
-        qpos: np.ndarray,
+        begin: Start,
         goals: Mapping[str, np.ndarray],
         mode: Mode,
         dt: float,
         *,
         start: np.ndarray | None = None,
-        drift: np.ndarray | None = None,
-        executed: np.ndarray | None = None,
-        offset: np.ndarray | None = None,
-        settled: np.ndarray | None = None,
-        facing: np.ndarray | None = None,
-        free: np.ndarray | None = None,
-        natural: np.ndarray | None = None,
-        balance: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Compute the proposed command.
-
-        Args:
-            qpos: Configuration now. Shape (nq,).
-            goals: Pose wanted after `dt` for each tracked frame. Shapes (7,).
-            mode: Mode of the robot; entries without effect in it stay neutral.
-            dt: Time to get there [s].
-            start: Where to start the iteration; neutral by default. Shape (k,).
-            drift: Base velocity beyond the commanded one. Shape (3,).
-            executed: Command executed now, from which the robot ramps. Shape (k,).
-            offset: As for `CommandModel.extrapolate`. Shape (k,).
-            settled: As for `CommandModel.extrapolate`. Shape (k,).
-            facing: Where a base on wheels shall face, as in `Evaluation`. Shape (2,).
-            free: Which entries may move; all that act by default. The others stay at `natural`.
-                Shape (k,), bool.
-            natural: Command from which efforts count; neutral by default. Shape (k,).
-            balance: Where the centre of mass shall rest on the base, from which a lean counts;
-                where it does as the robot stands by default. Shape (2,).
-
-        Returns:
-            Command within the bounds. Shape (k,).
-        """
-        return self.solve_from(
-            qpos,
-            goals,
-            mode,
-            dt,
-            start=start,
-            drift=drift,
-            executed=executed,
-            offset=offset,
-            settled=settled,
-            facing=facing,
-            free=free,
-            natural=natural,
-            balance=balance,
-        ).command
-
-    def solve_from(
-        self,
-        qpos: np.ndarray,
-        goals: Mapping[str, np.ndarray],
-        mode: Mode,
-        dt: float,
-        *,
-        start: np.ndarray | None = None,
-        drift: np.ndarray | None = None,
-        executed: np.ndarray | None = None,
-        offset: np.ndarray | None = None,
-        settled: np.ndarray | None = None,
         facing: np.ndarray | None = None,
         free: np.ndarray | None = None,
         natural: np.ndarray | None = None,
@@ -207,12 +148,25 @@ class KinematicProposal:
     ) -> Solution:
         """Compute the proposed command, and what it costs.
 
-        Args: as for `solve`; `bounds`, shapes (k,), instead of those of the command, and
-            `iterations` instead of those of the class.
+        Args:
+            begin: Where the robot is.
+            goals: Pose wanted after `dt` for each tracked frame. Shapes (7,).
+            mode: Mode of the robot; entries without effect in it stay neutral.
+            dt: Time to get there [s].
+            start: Where to start the iteration; neutral by default. Shape (k,).
+            facing: Where a base on wheels shall face, as in `Evaluation`. Shape (2,).
+            free: Which entries may move; all that act by default. The others stay at `natural`.
+                Shape (k,), bool.
+            natural: Command from which efforts count; neutral by default. Shape (k,).
+            balance: Where the centre of mass shall rest on the base, from which a lean counts;
+                where it does as the robot stands by default. Shape (2,).
+            bounds: Lower and upper bounds; those of the command by default. Shapes (k,).
+            iterations: Largest number of linearisations; that of the class by default.
 
         Returns:
             Command within the bounds, and its costs; no costs without goals.
         """
+        executed = begin.executed
         space = self.command_model.space
         free = self.command_model.acting(mode) if free is None else free
         index = np.flatnonzero(free)
@@ -236,17 +190,7 @@ class KinematicProposal:
         matrix = gradient = np.zeros(0)
         for _ in range(iterations or self.iterations):
             residual, jacobian = self.linearise(
-                qpos,
-                command,
-                goals,
-                mode,
-                dt,
-                drift=drift,
-                executed=executed,
-                offset=offset,
-                settled=settled,
-                facing=facing,
-                balance=balance,
+                begin, command, goals, mode, dt, facing=facing, balance=balance
             )
             share = (command[index] - natural[index]) / scale
             moved = change * (command[index] - last) / scale
@@ -272,16 +216,12 @@ class KinematicProposal:
 
     def linearise(
         self,
-        qpos: np.ndarray,
+        begin: Start,
         command: np.ndarray,
         goals: Mapping[str, np.ndarray],
         mode: Mode,
         dt: float,
         *,
-        drift: np.ndarray | None = None,
-        executed: np.ndarray | None = None,
-        offset: np.ndarray | None = None,
-        settled: np.ndarray | None = None,
         facing: np.ndarray | None = None,
         balance: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -293,7 +233,7 @@ class KinematicProposal:
             Residuals, shape (m,), and their Jacobian, shape (m, k).
         """
         model, weights = self.command_model, self.weights
-        future, motion = model.linearise(qpos, command, dt, mode, drift, executed, offset, settled)
+        future, motion = model.linearise(begin, command, dt, mode)
         self._linearisation.update(future)
         residuals, jacobians = [], []
         for name, goal in goals.items():

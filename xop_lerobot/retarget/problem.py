@@ -1,0 +1,222 @@
+"""The optimal control problem of Eq. 1: the dynamics that are rolled out, and what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import RobotState
+from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
+from xop_lerobot.morphology.morphology import Morphology
+from xop_lerobot.morphology.tuning import MpcConfig
+from xop_lerobot.retarget.costs import CollisionCost, FallCost, SupportArea, make_costs
+from xop_lerobot.retarget.costs.cost import Cost, Evaluation
+from xop_lerobot.retarget.decision import DecisionSpace
+from xop_lerobot.retarget.model.command_model import CommandModel, PlannerState, Start
+from xop_lerobot.retarget.model.linearisation import Readings, find_sites_on
+from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
+from xop_lerobot.retarget.references import Reference
+from xop_lerobot.retarget.rollout import PolicyRollout, Prediction
+from xop_lerobot.retarget.static_load import make_static_load
+
+
+class Scores(NamedTuple):
+    """What samples cost.
+
+    Attributes:
+        terms: Cost of every sample by term. Shapes (K,).
+        costs: Their sum; not finite for a sample that diverged. Shape (K,).
+        falls: Which of them fall, or diverge. Shape (K,), bool.
+        touches: Which of them touch an obstacle. Shape (K,), bool.
+    """
+
+    terms: Mapping[str, np.ndarray]
+    costs: np.ndarray
+    falls: np.ndarray
+    touches: np.ndarray
+
+
+class Problem:
+    r"""Eq. 1 without the way it is solved: :math:`\sum_k l(x_k, a_k, G) + V_f(x_H, G)`.
+
+    The dynamics (1b, 1c) are MuJoCo with the low-level policy and its memory in the loop. The
+    cost-to-go :math:`V_f` is that of an extrapolation beyond the horizon by the `CommandModel`.
+
+    Args:
+        morphology: The robot.
+        policy: Its low-level policy.
+        model: Its planning model in the scene.
+        decision: What is decided.
+        command_model: What a decision does.
+        num_threads: Threads of the physics.
+        obstacles: What to keep clear of; by default what is fixed in `model`.
+
+    Attributes:
+        support: Area over which the centre of mass stays; None for a robot that balances itself.
+        load: What joints bear of the weight above them; None where a policy moves them.
+        costs: The terms of the cost.
+        readings: Reads places off predictions.
+    """
+
+    def __init__(
+        self,
+        morphology: Morphology,
+        policy: LowLevelPolicy,
+        model: mujoco.MjModel,
+        decision: DecisionSpace,
+        command_model: CommandModel,
+        num_threads: int,
+        obstacles: Iterable[Obstacle] | None = None,
+    ) -> None:
+        self.morphology, self.decision, self.command_model = morphology, decision, command_model
+        self.rollout = PolicyRollout(model, policy, num_threads)
+        self._model = model
+        self.load = make_static_load(morphology, model)
+        self.support = None
+        if morphology.support:
+            resting = Readings(morphology, model, {}).compute_com(morphology.standing_qpos())
+            self.support = SupportArea(morphology.support, tuple(resting[:2]))
+        hull = morphology.hull_points
+        self._collision = CollisionCost(
+            make_obstacles(model) if obstacles is None else obstacles,
+            hull,
+            hands=morphology.hull_hands,
+            base=find_sites_on(model, morphology.base_body, hull),
+        )
+        self._fall = FallCost(
+            morphology.fall_tilt,
+            morphology.fall_height,
+            float(morphology.standing_qpos()[2]),
+            command_model.find_lowest_height(),
+            command_model.compute_rest_tilt,
+        )
+        self.costs: tuple[Cost, ...] = make_costs(
+            morphology, command_model, self.support, self._collision, self._fall, self.load
+        )
+        self.set_obstacles(self.obstacles)
+
+    @property
+    def obstacles(self) -> tuple[Obstacle, ...]:
+        """What is kept clear of."""
+        return self._collision.obstacles.obstacles
+
+    def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
+        """Keep clear of these and no others."""
+        self._collision.set_obstacles(obstacles)
+        # Without obstacles the hull is not read, which saves time.
+        hull = self.morphology.hull_points if obstacles else {}
+        self.readings = Readings(self.morphology, self._model, hull)
+
+    def restrict(self, decisions: np.ndarray, mode: Mode) -> np.ndarray:
+        """What mode, bounds (1d) and the policy's dead zones leave of decisions. (..., n)."""
+        space = self.decision.space
+        return space.restrict(space.leave_dead_zones(decisions, mode), mode)
+
+    def predict(
+        self, state: RobotState, now: PlannerState, decisions: np.ndarray, mode: Mode
+    ) -> Prediction:
+        """Roll decisions out, within the rate limits.
+
+        Args:
+            state: The robot now: :math:`x_0`, and the memory of its policy (1e, 1f).
+            now: Where it is, with the decision that it executes.
+            decisions: Decisions to try. Shape (K, H, n).
+            mode: Mode of the robot.
+        """
+        limited = self.command_model.limit_rates(now.executed, decisions, mode, POLICY_DT)
+        commands, arms = self.decision.split(limited, state.arms, self.command_model.body)
+        ramped = (state.command, state.arms, state.mode) if self.morphology.ramps else None
+        prediction = self.rollout.predict(
+            state.qpos, state.qvel, state.memory, commands, arms, mode, ramped
+        )
+        return prediction._replace(commands=limited)
+
+    def score(
+        self,
+        prediction: Prediction,
+        decisions: np.ndarray,
+        now: PlannerState,
+        reference: Reference,
+        proposal: np.ndarray,
+        mode: Mode,
+        config: MpcConfig,
+    ) -> Scores:
+        """Compute what predictions cost.
+
+        Args:
+            prediction: The predictions of `decisions`.
+            decisions: What was tried, before the rate limits. Shape (K, H, n).
+            now: Where the robot is, with the decision that it executes.
+            reference: What is to be followed.
+            proposal: The kinematic proposal. Shape (n,).
+            mode: Mode of the robot.
+            config: Parameters of the mode.
+        """
+        with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
+            evaluation = self._evaluate(
+                prediction, decisions, now, reference, proposal, mode, config
+            )
+            terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
+        costs = np.sum(list(terms.values()), axis=0)
+        falls = self._fall.find_falls(evaluation) | ~np.isfinite(costs)
+        return Scores(terms, costs, falls, self._collision.find_touches(evaluation))
+
+    def _evaluate(
+        self,
+        prediction: Prediction,
+        decisions: np.ndarray,
+        now: PlannerState,
+        reference: Reference,
+        proposal: np.ndarray,
+        mode: Mode,
+        config: MpcConfig,
+    ) -> Evaluation:
+        """All that the cost terms are computed from."""
+        model, executed = self.command_model, now.executed
+        origins = {
+            "proposal": proposal,
+            "neutral": self.decision.space.neutral,
+            "zero": np.zeros(len(executed)),
+        }
+        decided = model.acting(mode)
+        end = Start(
+            qpos=prediction.qpos[:, -1],
+            executed=prediction.commands[:, -1],
+            drift=now.drift,
+            offset=now.offset,
+            settled=model.settle(now.settled, decisions[:, -1], config.horizon * POLICY_DT),
+        )
+        extrapolated = model.extrapolate(end, decisions[:, -1], config.extrapolation_s, mode)
+        frames = self.morphology.frames
+        sites = {name: frames[name] for name in reference.goals}
+        read = self.readings.read(prediction.sensordata, sites)
+        then = self.readings.place(extrapolated, sites)
+        last = config.horizon + 1
+        return Evaluation(
+            qpos=prediction.qpos,
+            qvel=prediction.qvel,
+            commands=decisions,
+            executed=executed,
+            reference=np.where(decided, origins[config.control_reference], decisions[0, 0]),
+            poses=read.poses,
+            points=read.points,
+            velocities=read.velocities,
+            com=read.com,
+            terminal_qpos=extrapolated,
+            terminal_poses=then.poses,
+            terminal_points=then.points,
+            terminal_com=then.com,
+            goals={name: poses[:last] for name, poses in reference.goals.items()},
+            terminal_goals={name: poses[last] for name, poses in reference.goals.items()},
+            facing=reference.facing,
+            mode=mode,
+            dt=POLICY_DT,
+            weights=config.weights,
+            upright=tuple(name for name in reference.upright if name in sites),
+            drives=bool((decided & model.is_velocity()).any()),
+            balance=reference.balance,
+        )
