@@ -36,6 +36,8 @@ STATIONARY_S = 1.5
 """Time in which a stationary robot shall arrive [s]."""
 ROOM_HALF = 4.0
 """Half the width of the scene `room`, between the walls' faces [m]."""
+ANYWHERE = 1.5
+"""Largest distance of the goals of `anywhere` [m]."""
 WALL_DISTANCE = 0.25
 """Distance of the room's goals from the nearest wall [m]."""
 ROOM_HOLD_S = 1.5
@@ -182,6 +184,13 @@ def _curve(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: i
     return GoalTrack(home, LEAD_IN_S + CURVE_S, path=make_curve(home))
 
 
+def _anywhere(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+    """One random place within `ANYWHERE` of home, with a random heading."""
+    turn, far = rng.uniform(-math.pi, math.pi), ANYWHERE * math.sqrt(rng.uniform())
+    offset = (far * math.cos(turn), far * math.sin(turn), 0.0)
+    return _go(offset, rng.uniform(-math.pi, math.pi))(home, rng, hold, num_goals)
+
+
 def _room(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
     """Random places at `WALL_DISTANCE` from a random wall, with a random heading."""
     del hold
@@ -237,6 +246,9 @@ SCENARIOS: dict[str, Scenario] = {
         name: Scenario(name, title, Mode.MOBILE, build, tolerances=MOBILE_TOLERANCE)
         for name, (title, build) in _MOBILE.items()
     },
+    "anywhere": Scenario(
+        "anywhere", "a random goal within 1.5 m", Mode.MOBILE, _anywhere, "empty", MOBILE_TOLERANCE
+    ),
     "room": Scenario(
         "room", "goals 0.25 m from walls", Mode.MOBILE, _room, "room", MOBILE_TOLERANCE
     ),
@@ -254,6 +266,7 @@ SCENARIO_GROUPS: dict[str, tuple[str, ...]] = {
     "stationary": ("squat", "yaw", "pitch"),
     "mobile": ("diagonal", "ahead", "sideways", "quarter"),
     "curve": ("curve",),
+    "anywhere": ("anywhere",),
     "room": ("room",),
     "arms": ("arms",),
 }

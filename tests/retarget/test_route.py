@@ -18,7 +18,7 @@ from xop_lerobot.core.transforms import (
 )
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.guidance.guidance import Guidance, compute_times
+from xop_lerobot.retarget.guidance.guidance import Guidance, TwistRoom, compute_times
 from xop_lerobot.retarget.guidance.route import Footprint, RoutePlanner
 from xop_lerobot.retarget.model.command_model import PlannerState
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
@@ -100,7 +100,7 @@ def test_a_way_computed_anew_goes_on_as_before(planner, rby1):
     x, y, yaw, v, w = rby1.pivot, 0.0, 0.0, 0.0, 0.0
     from xop_lerobot.retarget.guidance.route import _Aim, _clamp, _steer
 
-    aim = _Aim(goal[0], goal[1], 0.3, 1.9, (RESTING - rby1.pivot, 0.0), rby1.driving)
+    aim = _Aim(goal[0], goal[1], 0.3, 1.9, (-rby1.pivot, 0.0), RESTING, rby1.driving)
     for _ in range(12):
         wanted = _steer(aim, x, y, yaw)
         v += _clamp(wanted[0] - v, 1.5 * 0.04)
@@ -108,11 +108,36 @@ def test_a_way_computed_anew_goes_on_as_before(planner, rby1):
         middle = yaw + w * 0.02
         x, y, yaw = x + v * 0.04 * math.cos(middle), y + v * 0.04 * math.sin(middle), yaw + w * 0.04
     base = (x - rby1.pivot * math.cos(yaw), y - rby1.pivot * math.sin(yaw))
-    rest = go(planner, rby1, goal, speeds=(v, w), duration=3.0, x=base[0], y=base[1], yaw=yaw)
+    qpos, head = place(rby1, x=base[0], y=base[1], yaw=yaw)
+    head[3:] = quat_from_yaw(0.3 + float(whole.turns[12]))  # the waist has turned meanwhile
+    rest = planner.plan(qpos, (v, w), "head", head, goal, 3.0)
     np.testing.assert_allclose(
         rest.headings, whole.headings[12 : 12 + len(rest.headings)], atol=1e-9
     )
     np.testing.assert_allclose(rest.offsets, whole.offsets[12 : 12 + len(rest.offsets)], atol=1e-9)
+
+
+def test_a_head_is_at_its_goal_however_its_waist_is_turned(rby1):
+    """Against MuJoCo: it sits ahead of the axis that it goes round."""
+    model, rng = build_model(rby1, "planning"), np.random.default_rng(0)
+    kinematics = SiteKinematics(model, (rby1.frames["head"],))
+    standing = rby1.standing_qpos()
+    ahead = float(kinematics.compute_poses(standing)["head"][0])
+    axis = TwistRoom(rby1).axis
+    from xop_lerobot.retarget.guidance.route import _Aim
+
+    for _ in range(20):
+        x, y, heading, look = rng.uniform(-1, 1), rng.uniform(-1, 1), *rng.uniform(-1.5, 1.5, 2)
+        aim = _Aim(0.3, -0.7, look, 1.9, (axis - rby1.pivot, 0.0), ahead - axis, rby1.driving)
+        across, along = aim.find_way(x, y, heading)
+        base = np.array([x + across, y + along]) - rby1.pivot * np.array(
+            [math.cos(heading), math.sin(heading)]
+        )
+        qpos = standing.copy()
+        qpos[:2], qpos[3:7] = base, quat_from_yaw(heading)
+        qpos[model.joint("torso_5").qposadr[0]] = look - heading
+        head = kinematics.compute_poses(qpos)["head"]
+        np.testing.assert_allclose(head[:2], [0.3, -0.7], atol=1e-6)
 
 
 @pytest.mark.parametrize("yaw", [1.5, -1.5])
@@ -261,11 +286,12 @@ def test_beside_a_wall_it_drives_on_before_it_turns(rby1):
     other = go(barred, rby1, goal, duration=1.6, **start)
 
     def compute_clearance(route):
-        carried = np.array([RESTING - rby1.pivot, 0.0])
         cosine, sine = np.cos(route.headings), np.sin(route.headings)
         far = np.hypot(*route.offsets.T)[:, None]
+        looks = quat_yaw(goal[3:]) + route.turns
         head = goal[:2] + route.offsets * (1 + LEAN / far)
-        axle = head - np.stack([cosine * carried[0], sine * carried[0]], axis=-1)
+        waist = head - RESTING * np.stack([np.cos(looks), np.sin(looks)], axis=-1)
+        axle = waist + rby1.pivot * np.stack([cosine, sine], axis=-1)
         return footprint.compute_clearance(axle, route.headings)
 
     assert compute_clearance(first).min() < -0.02

@@ -88,6 +88,13 @@ _NEAR = 0.2  # so near to its limit a waist is told of no more room [rad]
 _UPRIGHT = 0.9  # cosine of a waist's axis to the vertical, from which on it stands upright
 
 
+def find_waist(morphology: Morphology, model: mujoco.MjModel, data: mujoco.MjData) -> int | None:
+    """The uppermost joint that turns about the vertical, of a robot whose bodies are placed."""
+    joints = [model.joint(each.joint).id for each in morphology.effects if each.acts is Acts.JOINT]
+    upright = [joint for joint in joints if data.xaxis[joint, 2] > _UPRIGHT]
+    return upright[-1] if upright else None
+
+
 class TwistRoom:
     """Looks how far the waist may twist as the arms are now.
 
@@ -97,6 +104,9 @@ class TwistRoom:
 
     Args:
         morphology: The robot; without a joint that turns its waist it has all the room.
+
+    Attributes:
+        axis: How far ahead of the base is what the waist turns about, at rest [m].
     """
 
     def __init__(self, morphology: Morphology) -> None:
@@ -104,15 +114,12 @@ class TwistRoom:
         self._data = mujoco.MjData(self._model)
         self._data.qpos[:] = morphology.standing_qpos()
         mujoco.mj_kinematics(self._model, self._data)
-        joints = [
-            self._model.joint(effect.joint)
-            for effect in morphology.effects
-            if effect.acts is Acts.JOINT
-        ]
-        upright = [joint for joint in joints if self._data.xaxis[joint.id, 2] > _UPRIGHT]
         self._address = self._waist = -1
-        if upright:
-            waist = upright[-1]
+        self.axis = 0.0
+        joint = find_waist(morphology, self._model, self._data)
+        if joint is not None:
+            waist = self._model.joint(joint)
+            self.axis = float(self._data.xanchor[joint, 0])
             self._address, self._waist = int(waist.qposadr[0]), int(waist.bodyid[0])
             self._range = float(np.abs(waist.range).min())
             self._above = _find_subtree(self._model, self._waist)
@@ -208,7 +215,7 @@ class Guidance:
         self._routes: RoutePlanner | None = None
         if command_model.is_nonholonomic:
             self._room = TwistRoom(morphology)
-            self._routes = RoutePlanner(morphology, resting, footprint)
+            self._routes = RoutePlanner(morphology, resting, footprint, self._room.axis)
 
     def reset(self) -> None:
         """Start anew."""

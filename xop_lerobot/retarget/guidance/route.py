@@ -123,13 +123,24 @@ class Route:
 
 
 class _Aim(NamedTuple):
-    """What is to be carried where and how: goal x, y, where it looks, how it sits on the axle."""
+    """What is to be carried where, and how it sits on the axle.
+
+    Attributes:
+        x: Place of the goal [m].
+        y: The same.
+        look: Where it looks [rad].
+        twist: Largest twist of the waist in which the base may arrive [rad].
+        waist: Place of what the waist turns about, in the base's frame, from the axle [m].
+        ahead: How far ahead of that the tracked frame is, wherever it looks [m].
+        driving: How the base drives.
+    """
 
     x: float
     y: float
     look: float
     twist: float
-    carried: tuple[float, float]
+    waist: tuple[float, float]
+    ahead: float
     driving: Driving
 
     def clip(self, heading: float) -> float:
@@ -138,17 +149,18 @@ class _Aim(NamedTuple):
 
     def find_way(self, x: float, y: float, heading: float) -> tuple[float, float]:
         """From the axle at x, y to its place under the goal, arriving in `heading` [m]."""
-        ahead, aside = _rotate(*self.carried, heading)
-        return self.x - ahead - x, self.y - aside - y
+        waist, head = _rotate(*self.waist, heading), _rotate(self.ahead, 0.0, self.look)
+        return self.x - waist[0] - head[0] - x, self.y - waist[1] - head[1] - y
 
 
 class RoutePlanner:
     r"""Simulates how a base with two wheels drives to its goal as fast as its limits allow.
 
-    The axle's place p* depends on the heading ψ* in which the base arrives; a waist that turns
-    leaves that free by `Driving.arrival_twist` on either side of where the goal looks, so that the
-    base mostly need not turn again once it is there. It turns towards :math:`\pm(p^* - p)`,
-    forwards or backwards, whatever costs less of a turn and of a twist, by the braking law
+    The axle's place p* depends on the heading ψ* in which the base arrives, and on where the goal
+    looks, since a head sits ahead of its waist's axis. A waist that turns leaves ψ* free by
+    `Driving.arrival_twist` on either side of where the goal looks, so that the base mostly need
+    not turn again once it is there. It turns towards :math:`\pm(p^* - p)`, forwards or backwards,
+    whatever costs less of a turn and of a twist, by the braking law
     :math:`\omega = \sqrt{2\alpha|e|}`, and drives by the same law as far as it faces its way,
     :math:`v = \cos^4 e\,\sqrt{2 b d}`. Both depend on the present state alone, so that a way
     that is computed anew goes on as before.
@@ -163,6 +175,7 @@ class RoutePlanner:
         morphology: The robot.
         resting: How far ahead of the base each tracked frame is at rest [m].
         footprint: Tells how near the base comes to obstacles; None: there are none.
+        waist: How far ahead of the base is what the waist turns about [m].
 
     References:
         Siciliano et al., Robotics, 2009, section 11.5 (limits of feedback to a point for a
@@ -174,8 +187,9 @@ class RoutePlanner:
         morphology: Morphology,
         resting: Mapping[str, float],
         footprint: Footprint | None = None,
+        waist: float = 0.0,
     ) -> None:
-        self._footprint = footprint
+        self._footprint, self._waist = footprint, waist
         self._pivot, self._resting = morphology.pivot, dict(resting)
         assert morphology.driving is not None, f"how {morphology.name} drives is not known"
         self._driving = morphology.driving
@@ -213,32 +227,31 @@ class RoutePlanner:
         gx, gy = float(goal[0]), float(goal[1])
         if name in self._hands:
             carried = _rotate(float(pose[0]) - x, float(pose[1]) - y, -heading)
-            aim = _Aim(gx, gy, heading, 0.0, carried, drive)
+            aim = _Aim(gx, gy, heading, 0.0, carried, 0.0, drive)
         else:
             resting = self._resting[name] if ahead is None else ahead
-            carried = (resting - self._pivot, 0.0)
+            waist = (self._waist - self._pivot, 0.0)
             turning = min(max((abs(turn_rate) - _RESTING) / (_TURNING - _RESTING), 0.0), 1.0)
             most = drive.arrival_twist
             twist = min(most + turning * (drive.turning_twist - most), room)
-            aim = _Aim(gx, gy, float(compute_heading(goal[3:])), twist, carried, drive)
+            look = float(compute_heading(goal[3:]))
+            aim = _Aim(gx, gy, look, twist, waist, resting - self._waist, drive)
         count = math.ceil(duration / _DT) + 1
         way = _simulate(aim, x, y, heading, speeds, count)
         if self._footprint is not None and math.dist(way[0, :2], (gx, gy)) > _DETOUR_FROM:
             way = self._find_free(way, aim, speeds)
-        cosine, sine = np.cos(way[:, 2]), np.sin(way[:, 2])
-        offsets = way[:, :2] - (gx, gy)
-        offsets[:, 0] += cosine * carried[0] - sine * carried[1]
-        offsets[:, 1] += sine * carried[0] + cosine * carried[1]
-        far = np.hypot(offsets[:, 0], offsets[:, 1])
-        offsets *= np.maximum(0.0, 1 - drive.lean / np.maximum(far, drive.lean))[:, None]
-        twisted = abs(_wrap(aim.look - heading)) - (aim.twist or math.pi)
-        share = max(float(far[0]) / drive.lean - 1.0, twisted / _TWIST_RAMP)
-        share = min(max(share, 0.0), 1.0)
         turns = np.zeros(count)
         if name not in self._hands:
             limit = min(drive.waist, room + _ROOM_SPARE)
             twist = float(compute_heading(pose[3:])) - heading
             turns = _unwind(twist, aim.look, way[:, 2], limit, drive.waist_speed)
+        offsets = way[:, :2] - (gx, gy) + _turn(aim.waist, way[:, 2])
+        offsets += _turn((aim.ahead, 0.0), aim.look + turns)
+        far = np.hypot(offsets[:, 0], offsets[:, 1])
+        offsets *= np.maximum(0.0, 1 - drive.lean / np.maximum(far, drive.lean))[:, None]
+        twisted = abs(_wrap(aim.look - heading)) - (aim.twist or math.pi)
+        share = max(float(far[0]) / drive.lean - 1.0, twisted / _TWIST_RAMP)
+        share = min(max(share, 0.0), 1.0)
         return Route(np.arange(count) * _DT, offsets, way[:, 2], turns, share)
 
     def _find_free(self, way: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:
@@ -351,6 +364,14 @@ def _clamp(value: float, largest: float) -> float:
 def _rotate(x: float, y: float, angle: float) -> tuple[float, float]:
     cosine, sine = math.cos(angle), math.sin(angle)
     return cosine * x - sine * y, sine * x + cosine * y
+
+
+def _turn(place: tuple[float, float], headings: np.ndarray) -> np.ndarray:
+    """A place in frames of several headings. (2,), (n,) -> (n, 2)."""
+    cosine, sine = np.cos(headings), np.sin(headings)
+    return np.stack(
+        [cosine * place[0] - sine * place[1], sine * place[0] + cosine * place[1]], axis=-1
+    )
 
 
 def _wrap(angle: float) -> float:
