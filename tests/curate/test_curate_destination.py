@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from xop_lerobot.collect.folder import FolderTaken
+from xop_lerobot.core import folders as module
 from xop_lerobot.core.errors import XopError
-from xop_lerobot.curate import destination as module
+from xop_lerobot.core.folders import FolderTaken
 from xop_lerobot.curate.destination import Destination
 
 REPO = Path(__file__).parents[2]
@@ -92,7 +93,7 @@ def test_two_renames_that_were_cut_are_put_right(source, tmp_path, monkeypatch):
         rename(first, second)
 
     monkeypatch.setattr(module.os, "rename", cut)
-    monkeypatch.setattr(module.shutil, "rmtree", lambda *args, **options: None)
+    monkeypatch.setattr(shutil, "rmtree", lambda *args, **options: None)
     with pytest.raises(XopError, match="the power is gone"), Destination(None, source) as draft:
         build(draft)
     assert not source.exists()

@@ -15,7 +15,6 @@ Every step from one state to the next is one rename, after the files are on the 
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import json
 import os
 import shutil
@@ -26,16 +25,22 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.folders import (
+    FolderTaken,
+    check_no_mount,
+    finish_swap,
+    lock_folder,
+    swap_in,
+    sync,
+    sync_tree,
+    write_whole,
+)
 from xop_lerobot.recording.facts import FACTS_DIR
 
 COLLECT_FILE = FACTS_DIR / "collect.json"
 """What a collected dataset says of its collection."""
 DATASET = "dataset"
 """Directory of an episode's own dataset in its folder."""
-
-
-class FolderTaken(XopError, FileExistsError):
-    """The directory holds something that this collection must not touch."""
 
 
 class OtherSettings(XopError):
@@ -124,16 +129,14 @@ class CollectFolder:
         """
         self._check_root()
         self.work.mkdir(parents=True, exist_ok=True)
-        with (self.work / "lock").open("w") as lock:
+        refusal = (
+            f"another {self.command} is at work on '{self.root}'. Wait for it, or choose another "
+            f"{self.flag}"
+        )
+        with lock_folder(self.work, refusal):
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise FolderTaken(
-                    f"another {self.command} is at work on '{self.root}'. Wait for it, or choose "
-                    f"another {self.flag}"
-                ) from None
-            try:
-                self._finish_exchange()
+                # `merged` was whole before the dataset was put aside.
+                finish_swap(self.root, self.previous, self.merged)
                 self._check_settings(settings)
                 self._clean_up()
                 yield
@@ -144,11 +147,7 @@ class CollectFolder:
 
     def _check_root(self) -> None:
         root = self.root
-        if root.is_mount():
-            raise FolderTaken(
-                f"'{root}' is a mount point, which a dataset can't take the place of. Choose a "
-                f"directory inside it as {self.flag}"
-            )
+        check_no_mount(root, f"Choose a directory inside it as {self.flag}")
         if not root.exists() or (root / self.record).exists():
             return
         if (root / "meta" / "info.json").exists():
@@ -160,12 +159,6 @@ class CollectFolder:
             raise FolderTaken(
                 f"'{root}' exists and is no dataset. Choose another {self.flag}, or delete it"
             )
-
-    def _finish_exchange(self) -> None:
-        """Finish an exchange of datasets that was cut between its two renames."""
-        if self.previous.exists() and not self.root.exists():
-            # `merged` was whole before the first.
-            os.rename(self.merged if self.merged.exists() else self.previous, self.root)
 
     def _clean_up(self) -> None:
         """Delete what a killed run was at: a merge, episodes under way, or its own cleaning."""
@@ -236,7 +229,7 @@ class CollectFolder:
         write_whole(folder / "attempt.json", dataclasses.asdict(attempt))
         sync_tree(folder)
         os.rename(folder, self._find(attempt.index))
-        sync_folder(self._attempts)
+        sync(self._attempts)
 
     def exchange(self, indices: Iterable[int]) -> None:
         """Put the merged dataset in the place of the one before.
@@ -244,35 +237,6 @@ class CollectFolder:
         Args:
             indices: Episodes that are in it; their own files are deleted.
         """
-        sync_tree(self.merged)
-        if self.root.exists() and any(self.root.iterdir()):
-            os.rename(self.root, self.previous)
-        os.rename(self.merged, self.root)
-        sync_folder(self.root.parent)
-        for folder in (self.previous, *map(self._find, indices)):
+        swap_in(self.merged, self.root, self.previous)
+        for folder in (self.merged, self.previous, *map(self._find, indices)):
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def write_whole(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file that is there as a whole or not at all."""
-    draft = path.with_name(f"{path.name}.tmp")
-    draft.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    os.replace(draft, path)
-
-
-def sync_tree(folder: Path) -> None:
-    """See everything under `folder` on the disk."""
-    for path, _, names in os.walk(folder):
-        for name in names:
-            with (Path(path) / name).open("rb") as file:
-                os.fsync(file.fileno())
-        sync_folder(Path(path))
-
-
-def sync_folder(folder: Path) -> None:
-    """See the names in `folder` on the disk."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

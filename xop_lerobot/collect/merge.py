@@ -17,7 +17,8 @@ from lerobot.datasets import aggregate, dataset_metadata
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.utils import EPISODES_DIR
 
-from xop_lerobot.collect.folder import CollectFolder, write_whole
+from xop_lerobot.collect.folder import CollectFolder
+from xop_lerobot.core.folders import write_whole
 from xop_lerobot.recording.facts import CONFIG_FILE, EPISODES_FILE, FACTS_DIR, read_facts
 
 
