@@ -115,8 +115,13 @@ def test_a_study_goes_on_after_a_crash_and_after_a_line_cut_off(tmp_path):
     results.append(make_trial(SETUP, 1))
     lines = file.read_text().splitlines()
     assert json.loads(lines[-1])["seed"] == 1  # on a line of its own
+    assert [trial["seed"] for trial in collect(cell, results.load())] == [0, 1, 2]
+    file.write_text("\n".join([*lines[:3], '{"key": "half a li', lines[3]]))
     with pytest.raises(BadValue, match=r"line 4, is no trial"):
         results.load()  # in the middle, a broken line is no cut-off one
+    file.write_text("\n".join(lines))  # no newline at the end, but a whole line
+    results.append(make_trial(SETUP, 3))
+    assert [trial["seed"] for trial in results.load().values()] == [0, 2, 1, 3]
 
 
 def test_summary_of_hand_made_trials():

@@ -1,4 +1,4 @@
-"""Folders that appear as a whole or not at all, and on which one run works at a time.
+"""Folders and files that a kill cannot leave half written, and the lock of who writes them.
 
 A run works in a folder beside the place and renames the finished one into it. Everything is on the
 disk before it is renamed, so a kill or a power cut leaves the old folder or the new one, whole.
@@ -92,6 +92,35 @@ def write_whole(path: Path, content: Mapping[str, Any]) -> None:
     draft = path.with_name(f"{path.name}.tmp")
     draft.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     os.replace(draft, path)
+
+
+def append_line(path: Path, line: str) -> None:
+    """Append a JSON line and see it on the disk; what a kill has left of one before it goes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+b") as file:
+        file.seek(0)
+        rest = file.read().rpartition(b"\n")[2]
+        if _read_line(rest) is None:
+            file.truncate(file.tell() - len(rest))
+            rest = b""
+        file.write((b"\n" if rest else b"") + line.encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_lines(path: Path) -> list[dict[str, Any] | None]:
+    """Read a file of JSON lines, None for a line that is no object; one cut off at the end goes."""
+    lines = path.read_bytes().split(b"\n") if path.exists() else [b""]
+    rows = [_read_line(line) for line in lines]
+    return rows if rows[-1] is not None else rows[:-1]
+
+
+def _read_line(line: bytes) -> dict[str, Any] | None:
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    return row if isinstance(row, dict) else None
 
 
 def sync_tree(folder: Path) -> None:

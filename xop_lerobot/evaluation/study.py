@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -18,6 +17,7 @@ import yaml
 
 import xop_lerobot
 from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.core.folders import append_line, read_lines
 from xop_lerobot.core.pool import JobResult, run_jobs
 from xop_lerobot.core.yaml_words import find_word, load_yaml
 from xop_lerobot.evaluation.methods import find_absence, get_method
@@ -130,9 +130,6 @@ def compute_code_digest() -> str:
 class Results:
     """What has been run, in a folder: one JSON object a line, and the films beside.
 
-    Each trial is written as soon as it is over, so that whatever ends a study, what was run
-    stays. A last line that was cut off is passed over.
-
     Args:
         folder: The folder; made at the first trial.
     """
@@ -147,33 +144,17 @@ class Results:
         Raises:
             BadValue: If the file holds something else; names file and line.
         """
-        if not self._path.exists():
-            return {}
-        lines = self._path.read_bytes().split(b"\n")
-        found: dict[str, dict[str, Any]] = {}
-        for number, line in enumerate(lines, 1):
-            if not line.strip():
-                continue
-            try:
-                record = json.loads(line)
-                key, failed = record["key"], "error" in record
-            except (ValueError, TypeError, KeyError) as error:
-                if number == len(lines):  # no newline: killed while it was written
-                    continue
-                raise BadValue(f"'{self._path}', line {number}, is no trial: {error}") from error
-            if not failed:
-                found[key] = record
+        found = {}
+        for number, record in enumerate(read_lines(self._path), 1):
+            if record is None or "key" not in record:
+                raise BadValue(f"'{self._path}', line {number}, is no trial")
+            if "error" not in record:
+                found[record["key"]] = record
         return found
 
     def append(self, record: Mapping[str, Any]) -> None:
         """Write one trial, so that it survives whatever comes."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        whole = not self._path.exists() or self._path.read_bytes()[-1:] in (b"", b"\n")
-        with self._path.open("a", encoding="utf-8") as file:
-            line = json.dumps(record, allow_nan=False) + "\n"
-            file.write(line if whole else "\n" + line)
-            file.flush()
-            os.fsync(file.fileno())
+        append_line(self._path, json.dumps(record, allow_nan=False))
 
     def film_path(self, key: str) -> Path:
         """File of the positions of the trial `key`."""

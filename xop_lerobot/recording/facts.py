@@ -9,13 +9,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
+
+from xop_lerobot.core.folders import append_line, read_lines
 
 FACTS_DIR = Path("meta") / "xop"
 EPISODES_FILE = FACTS_DIR / "episodes.jsonl"
@@ -92,8 +93,6 @@ def append_facts(
 ) -> None:
     """Add the line of `episode`, which has `length` frames, and see it on the disk.
 
-    A line that a crash cut off is ended first, so that it takes no other along.
-
     Args:
         root: Directory of the dataset.
         episode: Index of the episode.
@@ -105,28 +104,12 @@ def append_facts(
     for name in _JSON_FACTS:
         row[name] = json.loads(row[name])
     row |= more
-    path = root / EPISODES_FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+b") as file:
-        if file.tell():
-            file.seek(-1, os.SEEK_END)
-            if file.read(1) != b"\n":
-                file.write(b"\n")
-        file.write(json.dumps(row).encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
+    append_line(root / EPISODES_FILE, json.dumps(row))
 
 
 def read_facts(root: Path) -> list[dict[str, Any]]:
     """Read `meta/xop/episodes.jsonl`; a line that a crash cut off is left out."""
-    path = root / EPISODES_FILE
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return rows
+    return [row for row in read_lines(root / EPISODES_FILE) if row is not None]
 
 
 def write_config(root: Path, config: Mapping[str, Any]) -> None:
