@@ -1,9 +1,9 @@
 """Jobs in parallel workers, of which each may die without taking others along.
 
 A worker is started once and does one job after another, so that imports are paid once. The
-standard library's pools lose every pending job when one process dies, and do not say which job
-it was; here a new worker takes the dead one's place, and its job is done again, or comes back
-with an error. Workers are processes of this machine (`run_jobs`), or of many
+standard library's `ProcessPoolExecutor` loses all jobs that are under way when one process dies,
+and does not say which one it was; here a new worker takes the dead one's place, and its job is done
+again, or comes back with an error. Workers are processes of this machine (`run_jobs`), or of many
 (`xop_lerobot.core.pool_ray`); what is common to both is `drive`.
 """
 
@@ -14,14 +14,14 @@ import os
 import signal
 import threading
 import traceback
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing.connection import wait
+from functools import partial
 from multiprocessing.context import ForkServerContext, SpawnContext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from xop_lerobot.core.errors import XopError
 
@@ -71,44 +71,19 @@ class WorkerDied(Exception):
     """A worker ended before its job did; the message says how."""
 
 
-class Worker(ABC):
-    """Does one job at a time.
+class Worker(Protocol):
+    """Does one job at a time."""
 
-    Attributes:
-        job: What it is at, or was at last.
-        tries: How often that has been begun.
-    """
-
-    job: Any = None
-    tries: int = 0
-
-    @abstractmethod
-    def give(self, job: Any) -> None:
-        """Let it begin with `job`."""
-
-    @abstractmethod
-    def take(self) -> tuple[Any, str]:
-        """Return value and error of the job that it has ended.
+    def do(self, job: Any) -> tuple[Any, str]:
+        """Do a job; return its value and its error, as in `JobResult`.
 
         Raises:
-            WorkerDied: If it has not, and never will.
+            WorkerDied: If the worker ends before the job does.
         """
+        ...
 
-    @abstractmethod
     def stop(self) -> None:
-        """End it at once, whatever it is at."""
-
-
-class Crew(ABC):
-    """Where workers come from."""
-
-    @abstractmethod
-    def start(self) -> Worker:
-        """Start a worker."""
-
-    @abstractmethod
-    def wait(self, busy: Sequence[Any]) -> Sequence[Worker]:
-        """Wait until at least one of `busy` has ended its job, or died; return those that did."""
+        """End it at once, whatever it is at; `do` raises in its thread."""
 
 
 def run_jobs(
@@ -134,40 +109,42 @@ def run_jobs(
         One result for each job, and one more for each time that it is begun again. Whatever ends
         the iteration ends the workers too.
     """
-    return drive(_Processes(function, preload), jobs, workers, tries)
+    return drive(partial(_Process, function, _make_context(preload)), jobs, workers, tries)
 
 
-def drive(crew: Crew, jobs: Iterable[Any], workers: int, tries: int) -> Generator[JobResult]:
-    """Do all jobs with at most so many workers of a crew; see `run_jobs`."""
+def drive(
+    start: Callable[[], Worker], jobs: Iterable[Any], workers: int, tries: int
+) -> Generator[JobResult]:
+    """Do all jobs with at most so many workers, of which `start` makes each; see `run_jobs`."""
     fresh, again = iter(jobs), deque[tuple[Any, int]]()
     idle: list[Worker] = []
-    busy: list[Worker] = []
-    try:
-        while True:
-            while len(busy) < workers and (order := _pick(fresh, again)):
-                worker = idle.pop() if idle else crew.start()
-                busy.append(worker)
-                worker.job, worker.tries = order
-                worker.give(worker.job)
-            while idle:  # there is nothing left for them, and others may wait for their cores
-                idle.pop().stop()
-            if not busy:
-                return
-            for worker in crew.wait(busy):
-                busy.remove(worker)
-                try:
-                    value, error = worker.take()
-                    idle.append(worker)
-                    yield JobResult(worker.job, value, error)
-                except WorkerDied as death:
-                    worker.stop()
-                    is_left = worker.tries < tries
-                    if is_left:
-                        again.append((worker.job, worker.tries + 1))
-                    yield JobResult(worker.job, error=str(death), again=is_left)
-    finally:
-        for worker in (*idle, *busy):
-            worker.stop()
+    busy: dict[Future[tuple[Any, str]], tuple[Worker, Any, int]] = {}
+    with ThreadPoolExecutor(workers) as threads:  # each waits for a worker
+        try:
+            while True:
+                while len(busy) < workers and (order := _pick(fresh, again)):
+                    worker = idle.pop() if idle else start()
+                    busy[threads.submit(worker.do, order[0])] = (worker, *order)
+                while idle:  # there is nothing left for them, and others may wait for their cores
+                    idle.pop().stop()
+                if not busy:
+                    return
+                for future in wait(busy, return_when=FIRST_COMPLETED).done:
+                    worker, job, tried = busy[future]
+                    is_left = False
+                    try:
+                        value, error = future.result()
+                        idle.append(worker)
+                    except WorkerDied as death:
+                        worker.stop()
+                        value, error, is_left = None, str(death), tried < tries
+                        if is_left:
+                            again.append((job, tried + 1))
+                    del busy[future]
+                    yield JobResult(job, value, error, is_left)
+        finally:
+            for worker in (*idle, *(each for each, _, _ in busy.values())):
+                worker.stop()
 
 
 def _pick(fresh: Iterable[Any], again: deque[tuple[Any, int]]) -> tuple[Any, int] | None:
@@ -189,26 +166,6 @@ def do_job(function: Function, job: Any) -> tuple[Any, str]:
         return None, f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
 
 
-class _Processes(Crew):
-    """Processes of this machine.
-
-    Args:
-        function: What does a job.
-        preload: What is imported once for all of them.
-    """
-
-    def __init__(self, function: Function, preload: Sequence[str]) -> None:
-        self._function, self._context = function, _make_context(preload)
-
-    def start(self) -> Worker:
-        return _Process(self._function, self._context)
-
-    def wait(self, busy: Sequence[_Process]) -> Sequence[Worker]:
-        # A worker that dies closes its end of the pipe, which counts as ready.
-        ready = wait([worker.pipe for worker in busy])
-        return [worker for worker in busy if worker.pipe in ready]
-
-
 def _make_context(preload: Sequence[str]) -> Context:
     """Processes that share nothing with this one: a fork would share OpenGL and threads."""
     if not preload or "forkserver" not in multiprocessing.get_all_start_methods():
@@ -218,11 +175,16 @@ def _make_context(preload: Sequence[str]) -> Context:
     return context
 
 
-class _Process(Worker):
-    """One process."""
+class _Process:
+    """A worker that is a process of this machine.
+
+    Args:
+        function: What does a job.
+        context: How processes are started.
+    """
 
     def __init__(self, function: Function, context: Context) -> None:
-        self.pipe, theirs = context.Pipe()
+        self._pipe, theirs = context.Pipe()
         self._process: BaseProcess = context.Process(
             target=_work, args=(function, theirs), daemon=True
         )
@@ -230,13 +192,10 @@ class _Process(Worker):
             self._process.start()
         theirs.close()
 
-    def give(self, job: Any) -> None:
-        with suppress(OSError):  # it is dead already, which `wait` will see
-            self.pipe.send(job)
-
-    def take(self) -> tuple[Any, str]:
+    def do(self, job: Any) -> tuple[Any, str]:
         try:
-            return self.pipe.recv()
+            self._pipe.send(job)
+            return self._pipe.recv()
         except (EOFError, OSError):
             self._process.join()
         code = self._process.exitcode or 0
@@ -246,7 +205,6 @@ class _Process(Worker):
     def stop(self) -> None:
         self._process.kill()
         self._process.join()
-        self.pipe.close()
 
 
 def _work(function: Function, pipe: Connection) -> None:

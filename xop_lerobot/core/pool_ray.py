@@ -11,21 +11,13 @@ import json
 import os
 import platform
 import re
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable
+from functools import partial
 from textwrap import shorten
 from typing import Any
 
 from xop_lerobot.core.errors import XopError
-from xop_lerobot.core.pool import (
-    ENVIRONMENT,
-    Crew,
-    Function,
-    JobResult,
-    Worker,
-    WorkerDied,
-    do_job,
-    drive,
-)
+from xop_lerobot.core.pool import ENVIRONMENT, Function, JobResult, WorkerDied, do_job, drive
 from xop_lerobot.core.versions import read_versions
 
 LOCAL = "local"
@@ -72,7 +64,7 @@ def run_jobs_on_ray(
         _connect(ray, address, workers)
     try:
         cores = int(ray.cluster_resources().get("CPU", 0))
-        yield from drive(_Actors(ray, function), jobs, workers or cores, tries)
+        yield from drive(partial(_Actor, ray, function), jobs, workers or cores, tries)
     finally:
         if mine:
             ray.shutdown()
@@ -128,8 +120,8 @@ class _Hand:
         return do_job(self._function, job)
 
 
-class _Actors(Crew):
-    """Actors of a Ray cluster, of a core each.
+class _Actor:
+    """A worker that is an actor of a Ray cluster, with a core of its own.
 
     Args:
         ray: The module.
@@ -137,38 +129,19 @@ class _Actors(Crew):
     """
 
     def __init__(self, ray: Any, function: Function) -> None:
-        self._ray, self._function = ray, function
-        self._hand = ray.remote(num_cpus=1, max_restarts=0)(_Hand)
-
-    def start(self) -> Worker:
         # Paths of the main process are not the machines'; what is set here holds for the libraries.
-        options = {"runtime_env": {"env_vars": dict(ENVIRONMENT)}}
-        return _Actor(self._ray, self._hand.options(**options).remote(self._function))
+        environment = {"env_vars": dict(ENVIRONMENT)}
+        make = ray.remote(num_cpus=1, max_restarts=0, runtime_env=environment)(_Hand)
+        self._ray, self._hand = ray, make.remote(function)
+        self._is_checked = False
 
-    def wait(self, busy: Sequence[_Actor]) -> Sequence[Worker]:
-        ready, _ = self._ray.wait([worker.answer for worker in busy], num_returns=1)
-        return [worker for worker in busy if worker.answer in ready]
-
-
-class _Actor(Worker):
-    """One actor."""
-
-    def __init__(self, ray: Any, hand: Any) -> None:
-        self._ray, self._hand = ray, hand
-        self._machine = hand.describe.remote()
-        self.answer: Any = None
-
-    def give(self, job: Any) -> None:
-        self.answer = self._hand.do.remote(job)
-
-    def take(self) -> tuple[Any, str]:
-        errors = self._ray.exceptions
+    def do(self, job: Any) -> tuple[Any, str]:
         try:
-            if self._machine is not None:  # asked for first, so it is there
-                _check_versions(*self._ray.get(self._machine))
-                self._machine = None
-            return self._ray.get(self.answer)
-        except errors.RayError as error:
+            if not self._is_checked:
+                _check_versions(*self._ray.get(self._hand.describe.remote()))
+                self._is_checked = True
+            return self._ray.get(self._hand.do.remote(job))
+        except self._ray.exceptions.RayError as error:
             # The first line says what became of it, and the last why, if anybody knows.
             text = re.sub(r"\x1b\[[\d;]*m", "", str(error))  # without colours
             lines = [line.strip() for line in text.splitlines() if line.strip()]
