@@ -16,8 +16,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -41,6 +39,7 @@ from benchmarks.tracking_setup import (
 )
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import UnknownName, XopError
+from xop_lerobot.core.pool import run_jobs
 from xop_lerobot.morphology.morphology import make_morphology
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -150,16 +149,16 @@ def run_all(args: argparse.Namespace, setups: list[TrackingSetup], results: Resu
         for key, setup, seed in missing:
             keep(key, run_trial(setup, seed))
         return keys
-    # A fresh interpreter per process: MuJoCo's threads do not survive a fork.
-    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        waiting: dict[Future[dict[str, Any]], str] = {
-            pool.submit(run_trial, setup, seed): key for key, setup, seed in missing
-        }
-        while waiting:
-            ready, _ = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in ready:
-                keep(waiting.pop(future), future.result())
+    for result in run_jobs(_run, missing, args.jobs):
+        if result.error:
+            raise XopError(f"{result.job[0]}: {result.error}")
+        keep(result.job[0], result.value)
     return keys
+
+
+def _run(job: tuple[str, TrackingSetup, int]) -> dict[str, Any]:
+    _, setup, seed = job
+    return run_trial(setup, seed)
 
 
 def print_tables(setups: list[TrackingSetup], runs: dict[str, dict[str, Any]]) -> None:
