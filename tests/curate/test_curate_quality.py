@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from xop_lerobot.core.errors import BadShape
 from xop_lerobot.core.transforms import pose_multiply, quat_exp
 from xop_lerobot.curate import quality
+from xop_lerobot.evaluation.metrics import summarise_errors
 
 DT = 0.04
 
@@ -54,15 +55,15 @@ def test_tracking_pools_the_frames_of_the_robot():
     chosen = np.zeros(100, bool)
     chosen[50:] = True
     near[0][:50] = far[1][:50] = 9  # not chosen
-    figures = quality.summarise_errors([near, far], chosen)
+    figures = summarise_errors([near, far], chosen)
     assert figures == pytest.approx((0.3, 0.5, 0.3, 0.4))
-    assert quality.summarise_errors([near], chosen) == pytest.approx((0.1, 0.1, 0.2, 0.2))
+    assert summarise_errors([near], chosen) == pytest.approx((0.1, 0.1, 0.2, 0.2))
 
 
 def test_tracking_of_nothing_is_nan():
-    assert all(map(math.isnan, quality.summarise_errors([], np.ones(3, bool))))
+    assert all(map(math.isnan, summarise_errors([], np.ones(3, bool))))
     errors = [(np.ones(3), np.ones(3))]
-    assert all(map(math.isnan, quality.summarise_errors(errors, np.zeros(3, bool))))
+    assert all(map(math.isnan, summarise_errors(errors, np.zeros(3, bool))))
 
 
 def test_wrong_shapes_are_named():

@@ -118,10 +118,10 @@ def test_tracking_error_leaves_out_what_has_no_goal():
     goal[0, 3:] = quat_from_yaw(0.5)
     goal[2] = np.nan
     error = compute_tracking_error(pose, goal)
-    assert error.position == pytest.approx(0.4 / 3)
-    assert error.angle == pytest.approx(0.5 / 3)
-    assert error.position_p95 == pytest.approx(0.28)
-    assert math.isnan(compute_tracking_error(pose, np.full((4, 7), np.nan)).position)
+    assert error.mean == pytest.approx(0.4 / 3)
+    assert error.angle_mean == pytest.approx(0.5 / 3)
+    assert error.p95 == pytest.approx(0.28)
+    assert math.isnan(compute_tracking_error(pose, np.full((4, 7), np.nan)).mean)
 
 
 def test_roughness_of_a_parabola_and_of_a_ramp():

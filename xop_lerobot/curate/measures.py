@@ -14,8 +14,13 @@ from xop_lerobot.core.state import FRAMES
 from xop_lerobot.curate import quality
 from xop_lerobot.curate.entries import EpisodeEntry
 from xop_lerobot.curate.expression import Kind
-from xop_lerobot.evaluation.metrics import compute_jerk, compute_roughness
-from xop_lerobot.evaluation.summary import compute_falls
+from xop_lerobot.evaluation.metrics import (
+    compute_falls,
+    compute_jerk,
+    compute_pose_errors,
+    compute_roughness,
+    summarise_errors,
+)
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 
 _FLAG, _NUMBER, _TEXT = Kind.FLAG, Kind.NUMBER, Kind.TEXT
@@ -267,11 +272,11 @@ def _compute_tracking(episode: Episode) -> Values:
         )
         # A goal of zeros is none: its quaternion has no length.
         chosen = chosen & np.isfinite(goal).all(axis=1) & goal[:, 3:].any(axis=1)
-        errors[frame] = quality.compute_pose_errors(pose, goal)
+        errors[frame] = compute_pose_errors(pose, goal)
     groups = {"tracking": list(errors.values())}
     groups |= {f"tracking_{frame}": [each] for frame, each in errors.items()}
     for prefix, pairs in groups.items():
-        figures = quality.summarise_errors(pairs, chosen)
+        figures = summarise_errors(pairs, chosen)
         values |= {f"{prefix}_{name}": value for name, value in figures._asdict().items()}
     return values
 

@@ -4,7 +4,7 @@ Arrays have one row for each frame, `n` in all, at a time step of `dt` seconds. 
 x y z qw qx qy qz. What a figure would be an average of may never have come (the operator never
 engaged); the figure is nan then.
 
-The jerk and roughness of commands, and the count of falls, are those of `xop_lerobot.evaluation`.
+Tracking errors, jerk, roughness and falls are those of `xop_lerobot.evaluation.metrics`.
 
 References:
     [1] N. Hogan, D. Sternad. Sensitivity of smoothness measures to movement duration, amplitude,
@@ -22,7 +22,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from xop_lerobot.core.errors import BadShape
-from xop_lerobot.core.transforms import quat_rotate, rotation_error
+from xop_lerobot.core.transforms import quat_rotate
+from xop_lerobot.evaluation import metrics
 from xop_lerobot.evaluation.metrics import NEVER, find_runs
 
 STILL_WINDOW_S = 0.5
@@ -36,22 +37,7 @@ LDLJ_WINDOW_S = 2.0
 """Length of the pieces that smoothness is computed of [s]: about that of one movement."""
 LATE_FACTOR = 1.5
 """A frame is late if it came this many periods after the one before."""
-
-
-class TrackingFigures(NamedTuple):
-    """How far frames of the robot are from their goals.
-
-    Attributes:
-        mean: Mean distance [m].
-        p95: 95th percentile of the distance [m].
-        angle_mean: Mean angle of the rotation to the goal [rad].
-        angle_p95: 95th percentile of that angle [rad].
-    """
-
-    mean: float
-    p95: float
-    angle_mean: float
-    angle_p95: float
+compute_pose_errors = metrics.compute_pose_errors
 
 
 class GapFigures(NamedTuple):
@@ -74,47 +60,6 @@ class SpreadFigures(NamedTuple):
     mean: float
     p95: float
     max: float
-
-
-def compute_pose_errors(pose: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Compute :math:`\lVert p - p^*\rVert` [m] and :math:`\lVert\log(R^* R^T)\rVert` [rad].
-
-    Args:
-        pose: Pose of a frame of the robot. Shape (n, 7).
-        goal: Its goal. Shape (n, 7).
-
-    Returns:
-        Distance and angle in each frame. Shapes (n,).
-
-    Raises:
-        BadShape: If the shapes do not fit.
-    """
-    if goal.shape != pose.shape or pose.shape[1:] != (7,):
-        raise BadShape("goal", (len(pose), 7), goal.shape)
-    distance = np.linalg.norm(pose[:, :3] - goal[:, :3], axis=1)
-    angle = np.linalg.norm(rotation_error(goal[:, 3:], pose[:, 3:]), axis=1)
-    return distance, angle
-
-
-def summarise_errors(
-    errors: Sequence[tuple[np.ndarray, np.ndarray]], chosen: np.ndarray
-) -> TrackingFigures:
-    """Summarise `compute_pose_errors` of one or several frames of the robot, all pooled.
-
-    Args:
-        errors: Distance and angle of each, as `compute_pose_errors` gives them.
-        chosen: Frames of the episode that count. Shape (n,), bool.
-    """
-    if not errors or not chosen.any():
-        return TrackingFigures(NEVER, NEVER, NEVER, NEVER)
-    distance = np.concatenate([each[chosen] for each, _ in errors])
-    angle = np.concatenate([each[chosen] for _, each in errors])
-    return TrackingFigures(
-        float(distance.mean()),
-        float(np.percentile(distance, 95)),
-        float(angle.mean()),
-        float(np.percentile(angle, 95)),
-    )
 
 
 def summarise_spread(values: np.ndarray) -> SpreadFigures:

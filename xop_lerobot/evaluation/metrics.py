@@ -6,6 +6,7 @@ average of may never have come (no tick in standing mode, no goal); the figure i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,18 +36,20 @@ class BalancePower(NamedTuple):
     signed: float
 
 
-class TrackingError(NamedTuple):
-    """Distance of a frame of the robot from its goal.
+class TrackingFigures(NamedTuple):
+    """How far frames of the robot are from their goals.
 
     Attributes:
-        position: Mean distance [m].
-        position_p95: 95th percentile of the distance [m].
-        angle: Mean angle of the rotation to the goal [rad].
+        mean: Mean distance [m].
+        p95: 95th percentile of the distance [m].
+        angle_mean: Mean angle of the rotation to the goal [rad].
+        angle_p95: 95th percentile of that angle [rad].
     """
 
-    position: float
-    position_p95: float
-    angle: float
+    mean: float
+    p95: float
+    angle_mean: float
+    angle_p95: float
 
 
 def compute_balance_power(
@@ -149,23 +152,56 @@ def compute_tilt(quat: np.ndarray, chosen: np.ndarray | None = None) -> float:
     return float(np.arccos(np.clip(side * cosine, -1, 1)).mean())
 
 
-def compute_tracking_error(pose: np.ndarray, goal: np.ndarray) -> TrackingError:
-    r"""Compute :math:`\lVert p - p^*\rVert` and :math:`\lVert\log(R^* R^T)\rVert`, averaged.
+def compute_pose_errors(pose: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    r"""Compute :math:`\lVert p - p^*\rVert` [m] and :math:`\lVert\log(R^* R^T)\rVert` [rad].
 
     Args:
-        pose: True pose of a frame, x y z qw qx qy qz. Shape (n, 7).
-        goal: Its goal; nan in ticks without one, which do not count. Shape (n, 7).
+        pose: Pose of a frame of the robot. Shape (n, 7).
+        goal: Its goal. Shape (n, 7).
+
+    Returns:
+        Distance and angle in each tick. Shapes (n,).
+
+    Raises:
+        BadShape: If the shapes do not fit.
     """
-    if goal.shape != pose.shape:
-        raise BadShape("goal", pose.shape, goal.shape)
-    known = np.isfinite(goal).all(axis=1)
-    if not known.any():
-        return TrackingError(NEVER, NEVER, NEVER)
-    distance = np.linalg.norm(pose[known, :3] - goal[known, :3], axis=1)
-    angle = np.linalg.norm(rotation_error(goal[known, 3:], pose[known, 3:]), axis=1)
-    return TrackingError(
-        float(distance.mean()), float(np.percentile(distance, 95)), float(angle.mean())
+    if goal.shape != pose.shape or pose.shape[1:] != (7,):
+        raise BadShape("goal", (len(pose), 7), goal.shape)
+    distance = np.linalg.norm(pose[:, :3] - goal[:, :3], axis=1)
+    angle = np.linalg.norm(rotation_error(goal[:, 3:], pose[:, 3:]), axis=1)
+    return distance, angle
+
+
+def summarise_errors(
+    errors: Sequence[tuple[np.ndarray, np.ndarray]], chosen: np.ndarray
+) -> TrackingFigures:
+    """Summarise `compute_pose_errors` of one or several frames of the robot, all pooled.
+
+    Args:
+        errors: Distance and angle of each, as `compute_pose_errors` gives them.
+        chosen: Ticks that count. Shape (n,), bool.
+    """
+    if not errors or not chosen.any():
+        return TrackingFigures(NEVER, NEVER, NEVER, NEVER)
+    distance = np.concatenate([each[chosen] for each, _ in errors])
+    angle = np.concatenate([each[chosen] for _, each in errors])
+    return TrackingFigures(
+        float(distance.mean()),
+        float(np.percentile(distance, 95)),
+        float(angle.mean()),
+        float(np.percentile(angle, 95)),
     )
+
+
+def compute_tracking_error(pose: np.ndarray, goal: np.ndarray) -> TrackingFigures:
+    """Summarise the errors of one frame of the robot in the ticks in which it has a goal.
+
+    Args:
+        pose: True pose of the frame. Shape (n, 7).
+        goal: Its goal; nan in ticks without one. Shape (n, 7).
+    """
+    known = np.asarray(np.isfinite(goal).all(axis=1))
+    return summarise_errors([compute_pose_errors(pose, goal)], known)
 
 
 def compute_roughness(command: np.ndarray, half_range: np.ndarray, dt: float) -> float:
@@ -210,6 +246,26 @@ def compute_slip(feet: np.ndarray, dt: float, height: float = 0.01) -> float:
     bears = low[1:] & low[:-1]
     speed = np.linalg.norm(np.diff(feet[..., :2], axis=0), axis=-1) / dt
     return float(speed[bears].mean()) if bears.any() else NEVER
+
+
+def compute_falls(base_pose: np.ndarray, fall_height: float, fall_tilt: float) -> int:
+    r"""Count how often a base falls: lower than `fall_height` or tilted over `fall_tilt`.
+
+    The tilt is :math:`\arccos(e_z \cdot R e_z)`. A robot that stays down has fallen once.
+
+    Args:
+        base_pose: Base in the world. Shape (T, 7).
+        fall_height: Height under which it counts as fallen [m].
+        fall_tilt: Tilt over which it counts as fallen [rad].
+
+    Returns:
+        Number of times the robot went down.
+    """
+    base_pose = np.asarray(base_pose, float)
+    up = quat_rotate(base_pose[:, 3:], _UP)
+    tilt = np.arccos(np.clip(up[:, 2], -1.0, 1.0))
+    down = (base_pose[:, 2] < fall_height) | (tilt > fall_tilt)
+    return int(np.count_nonzero(np.diff(down.astype(int), prepend=0) > 0))
 
 
 def compute_longest_hold(within: np.ndarray, dt: float) -> float:

@@ -9,15 +9,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
-from xop_lerobot.core.transforms import quat_rotate
+from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.evaluation.metrics import compute_falls, compute_pose_errors
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
 
 END_S = 0.5
 """The error "at the end" is the mean over this last part of the engaged time [s]."""
-POSE_SIZE = 7
 HEALTH = "retargeter.health"
 SOLVE_TIME = "solve_time"
 
@@ -49,39 +48,6 @@ class EpisodeSummary:
     plan_ms_p99: float
 
 
-def compute_distance(pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    r"""Compute :math:`\|p - p_{goal}\|` of two pose tracks. Shapes (T, 7) -> (T,) [m].
-
-    Raises:
-        BadShape: If one is no pose track, or their lengths differ.
-    """
-    pose, goal = np.asarray(pose, float), np.asarray(goal, float)
-    for name, track in (("pose", pose), ("goal", goal)):
-        if track.shape != (len(pose), POSE_SIZE):
-            raise BadShape(name, (len(pose), POSE_SIZE), track.shape)
-    return np.linalg.norm(pose[:, :3] - goal[:, :3], axis=1)
-
-
-def compute_falls(base_pose: np.ndarray, fall_height: float, fall_tilt: float) -> int:
-    r"""Count how often a base falls: lower than `fall_height` or tilted over `fall_tilt`.
-
-    The tilt is :math:`\arccos(e_z \cdot R e_z)`. A robot that stays down has fallen once.
-
-    Args:
-        base_pose: Base in the world. Shape (T, 7).
-        fall_height: Height under which it counts as fallen [m].
-        fall_tilt: Tilt over which it counts as fallen [rad].
-
-    Returns:
-        Number of times the robot went down.
-    """
-    base_pose = np.asarray(base_pose, float)
-    up = quat_rotate(base_pose[:, 3:], np.array([0.0, 0.0, 1.0]))
-    tilt = np.arccos(np.clip(up[:, 2], -1.0, 1.0))
-    down = (base_pose[:, 2] < fall_height) | (tilt > fall_tilt)
-    return int(np.count_nonzero(np.diff(down.astype(int), prepend=0) > 0))
-
-
 def compute_episode_summary(
     columns: Mapping[str, np.ndarray],
     health_names: Sequence[str],
@@ -108,9 +74,8 @@ def compute_episode_summary(
             f"{robot}: the operator never engaged in {len(engaged) / fps:.1f} s, so there is "
             "nothing to compare. Was the episode too short?"
         )
-    distance = compute_distance(
-        _get_column(columns, "robot.head"), _get_column(columns, "goal.head")
-    )[engaged]
+    head, goal = (_get_column(columns, key)[engaged] for key in ("robot.head", "goal.head"))
+    distance, _ = compute_pose_errors(head.astype(float), goal.astype(float))
     if SOLVE_TIME not in health_names:
         raise UnknownName("health figure", SOLVE_TIME, health_names)
     solve = np.asarray(_get_column(columns, HEALTH), float)
