@@ -39,6 +39,8 @@ from xop_lerobot.core.transforms import (
     pose_multiply,
     quat_from_yaw,
 )
+from xop_lerobot.evaluation.trial import TraceRows
+from xop_lerobot.evaluation.trial_metrics import compute_feet
 from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.scene import build_model
@@ -49,7 +51,6 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
-from xop_lerobot.retarget.plan import Status
 from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
@@ -149,27 +150,11 @@ def _level(pose: np.ndarray) -> np.ndarray:
     return make_pose(pose[:3], quat_from_yaw(compute_heading(pose[3:])))
 
 
-class _Truth:
-    """Where the robot truly is: tracked frames, and the middle of each foot or wheel."""
-
-    def __init__(self, morphology: Morphology) -> None:
-        self._frames = morphology.frames
-        self._groups = morphology.contact_groups
-        points = tuple(point for group in self._groups for point in group)
-        model = build_model(morphology, "planning")
-        self._kinematics = SiteKinematics(model, (*self._frames.values(), *points))
-
-    def compute_frames(self, qpos: np.ndarray) -> dict[str, np.ndarray]:
-        """Poses of the tracked frames. Shapes (7,)."""
-        poses = self._kinematics.compute_poses(qpos)
-        return {name: poses[site] for name, site in self._frames.items()}
-
-    def compute_feet(self, qpos: np.ndarray) -> np.ndarray:
-        """Middle of each foot. Shape (f, 3)."""
-        poses = self._kinematics.compute_poses(qpos)
-        return np.array(
-            [np.mean([poses[point][:3] for point in group], axis=0) for group in self._groups]
-        )
+def locate_frames(morphology: Morphology, qpos: np.ndarray) -> dict[str, np.ndarray]:
+    """Find the tracked frames in one or many configurations. Shape (..., nq) -> (..., 7) each."""
+    model = build_model(morphology, "planning")
+    poses = SiteKinematics(model, tuple(morphology.frames.values())).compute_poses(qpos)
+    return {name: poses[site] for name, site in morphology.frames.items()}
 
 
 def get_scenario(name: str) -> Scenario:
@@ -224,8 +209,7 @@ def _run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajector
     try:
         # What is put into the hands makes a robot sink and lean before it has found its balance.
         loop.reset(seed, settle_s=LOADED_SETTLE_S if setup.payload else SETTLE_S)
-        truth = _Truth(morphology)
-        frames = truth.compute_frames(loop.state.true_qpos)
+        frames = locate_frames(morphology, loop.state.true_qpos)
         home = frames["head"]
         home = make_pose(home[:3], quat_from_yaw(compute_heading(home[3:])))
         rng = np.random.default_rng((seed, 7))
@@ -234,67 +218,47 @@ def _run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajector
         teleoperation.device = GoalDevice(scenario, track, wrists)
         teleoperation.alignment = WorldAlignment()
         teleoperation.reset()
-        return track, _drive(loop, teleoperation, truth, track)
+        return track, _drive(loop, teleoperation, track)
     finally:
         teleoperation.disconnect()
         loop.close()
 
 
-def _drive(
-    loop: PolicyLoop, teleoperation: Teleoperation, truth: _Truth, track: GoalTrack
-) -> Trajectory:
+def _drive(loop: PolicyLoop, teleoperation: Teleoperation, track: GoalTrack) -> Trajectory:
     """Close the loop for the length of the track, and write down what is true."""
-    rows: dict[str, list[Any]] = {
-        name: []
-        for name in (
-            "time", "head", "goal", "base", "command", "feet", "hands", "fallen", "collision"
-        )
-    }  # fmt: skip
-    solves: list[float] = []
-    failed: list[bool] = []
-    intervened: list[bool] = []
-    contacts: set[tuple[str, str]] = set()
-    device = teleoperation.device
+    rows, contacts = TraceRows(), set[tuple[str, str]]()
+    device, dt = teleoperation.device, teleoperation.dt
     assert isinstance(device, GoalDevice)
-    dt, plan_age = teleoperation.dt, np.inf
-    while True:
+    clocks = []
+    while (clock := device.clock(loop.state.time)) < track.duration - dt / 2:
         state = loop.state
-        clock = device.clock(state.time)
-        if clock >= track.duration - dt / 2:
-            break
         action, record = teleoperation.step(state)
-        frames = truth.compute_frames(state.true_qpos)
-        goals = record.goal.poses if record.goal is not None else {}
-        if goals or clock > 0:
-            rows["time"].append(clock)
-            rows["head"].append(frames["head"])
-            rows["goal"].append(goals.get("head", track.head_at(clock)))
-            rows["base"].append(state.true_qpos[:7])
-            rows["command"].append(action.command)
-            rows["feet"].append(truth.compute_feet(state.true_qpos))
-            rows["hands"].append(
-                [
-                    np.linalg.norm(goals[name][:3] - frames[name][:3]) if goals else np.nan
-                    for name in FRAMES[1:]
-                ]
-            )
-            rows["fallen"].append(state.fallen)
-            rows["collision"].append(state.collision)
-            plan_age = record.health.get("plan_age", np.inf)
-            if plan_age == 0:
-                solves.append(record.health["solve_time"])
-                failed.append(record.health.get("status", 0.0) != Status.OK)
-                intervened.append(record.health.get("intervention", 0.0) > 0)
+        if record.goal is not None or clock > 0:
+            rows.add(state, action.command, record)
+            clocks.append(clock)
         if state.fallen:
             break
         loop.execute(action, dt)
         contacts.update(loop.plant.measure().contacts)
+    trace = rows.make_trace()
+    frames = locate_frames(loop.morphology, trace.qpos)
+    goal = trace.goals["head"]
+    for tick in np.flatnonzero(np.isnan(goal[:, 0])):  # the robot has let go
+        goal[tick] = track.head_at(clocks[tick])
+    offsets = [trace.goals[name][:, :3] - frames[name][:, :3] for name in FRAMES[1:]]
     return Trajectory(
-        **{name: np.array(values) for name, values in rows.items()},
-        solve_s=np.array(solves),
+        time=np.array(clocks),
+        head=frames["head"],
+        goal=goal,
+        base=trace.qpos[:, :7],
+        command=trace.command,
+        feet=compute_feet(loop.morphology, trace.qpos),
+        hands=np.linalg.norm(offsets, axis=-1).T,
         contacts=tuple(sorted(contacts)),
-        failed=np.array(failed, dtype=bool),
-        intervened=np.array(intervened, dtype=bool),
+        **{
+            name: getattr(trace, name)
+            for name in ("fallen", "collision", "solve_s", "failed", "intervened")
+        },
     )
 
 

@@ -136,11 +136,11 @@ def test_the_loop_runs_what_the_ablation_says(short, name, monkeypatch):
     seen = {}
     drive = tracking._drive
 
-    def spy(loop, teleoperation, truth, track):
+    def spy(loop, teleoperation, track):
         seen["configs"] = dict(teleoperation.retargeter.configs)
         seen["sync"] = teleoperation.config.retargeter.sync
         seen["noise"] = loop.plant.config.noise
-        return drive(loop, teleoperation, truth, track)
+        return drive(loop, teleoperation, track)
 
     monkeypatch.setattr(tracking, "_drive", spy)
     overrides = {} if name == "table1_equal" else SMALL

@@ -98,6 +98,7 @@ def make_trace(toy, opening, palm):
         time=np.arange(n) * 0.04, engaged=np.arange(n) > 0, mode=np.zeros(n), qpos=pose, qvel=pose,
         effort=pose, command=pose, frames={"left_palm": at(palm), "right_palm": at(far)}, goals={},
         objects={"toy": at(toy), "opening": at(np.tile(opening, (n, 1)))}, solve_s=np.zeros(0),
+        fallen=np.zeros(n), collision=np.zeros(n), failed=np.zeros(0), intervened=np.zeros(0),
     )  # fmt: skip
 
 

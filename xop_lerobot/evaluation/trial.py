@@ -22,6 +22,7 @@ from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.display import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.retarget.plan import Status
 from xop_lerobot.session import RobotInfo, TickRecord
 from xop_lerobot.tasks.task import TASKS, TaskStatus, make_task
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
@@ -105,7 +106,11 @@ class Trace:
         frames: Poses of head, wrists and palms. Shapes (n, 7).
         goals: Goals of head and wrists, nan where there are none. Shapes (n, 7).
         objects: Poses of what the task put into the scene. Shapes (n, 7).
+        fallen: Whether the robot has fallen. Shape (n,), bool.
+        collision: Whether it touched anything but the ground in the tick. Shape (n,), bool.
         solve_s: Duration of each solve of the retargeter [s]. Shape (m,).
+        failed: Whether each solve had no sample of finite cost. Shape (m,), bool.
+        intervened: Whether the retargeter slowed or vetoed each plan. Shape (m,), bool.
     """
 
     time: np.ndarray
@@ -118,7 +123,11 @@ class Trace:
     frames: Mapping[str, np.ndarray]
     goals: Mapping[str, np.ndarray]
     objects: Mapping[str, np.ndarray]
+    fallen: np.ndarray
+    collision: np.ndarray
     solve_s: np.ndarray
+    failed: np.ndarray
+    intervened: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -171,14 +180,16 @@ class Trial:
 
 
 @dataclass
-class _Rows:
-    """Collects ticks."""
+class TraceRows:
+    """Collects ticks of a closed loop."""
 
     ticks: list[dict[str, Any]] = field(default_factory=list)
-    solves: list[float] = field(default_factory=list)
+    solves: list[tuple[float, bool, bool]] = field(default_factory=list)
 
-    def add(self, state: RobotState, view: View, command: np.ndarray, record: TickRecord) -> None:
-        """Add one tick."""
+    def add(
+        self, state: RobotState, command: np.ndarray, record: TickRecord, view: View | None = None
+    ) -> None:
+        """Add one tick; without a view, a trace has no frames and objects."""
         goals = record.goal.poses if record.goal is not None else {}
         nothing = np.full(7, np.nan)
         self.ticks.append(
@@ -190,13 +201,17 @@ class _Rows:
                 "qvel": state.true_qvel,
                 "effort": state.effort,
                 "command": command,
-                "frames": dict(view.frames),
+                "frames": {} if view is None else dict(view.frames),
                 "goals": {name: goals.get(name, nothing) for name in FRAMES},
-                "objects": {name: each.pose for name, each in view.objects.items()},
+                "objects": {} if view is None else {n: o.pose for n, o in view.objects.items()},
+                "fallen": state.fallen,
+                "collision": state.collision,
             }
         )
-        if record.engaged and record.health.get("plan_age", np.inf) == 0:
-            self.solves.append(record.health.get("solve_time", 0.0))
+        health = record.health
+        if record.engaged and health.get("plan_age", np.inf) == 0:
+            failed, intervened = health.get("status", Status.OK), health.get("intervention", 0)
+            self.solves.append((health.get("solve_time", 0.0), failed != Status.OK, intervened > 0))
 
     def make_trace(self) -> Trace:
         """Put the ticks together."""
@@ -209,7 +224,8 @@ class _Rows:
                 }
             else:
                 columns[name] = np.array(values)
-        return Trace(**columns, solve_s=np.array(self.solves))
+        solves = np.array(self.solves, float).reshape(-1, 3).T
+        return Trace(**columns, solve_s=solves[0], failed=solves[1] > 0, intervened=solves[2] > 0)
 
 
 class _Filming:
@@ -299,7 +315,7 @@ def _drive(
     watch: Callable[[Stage, View, TickRecord], None] | None,
 ) -> Trial:
     """Close the loop until the task is over."""
-    rows, filming = _Rows(), _Filming(stage, setup.fps)
+    rows, filming = TraceRows(), _Filming(stage, setup.fps)
     dt, start = 1 / setup.fps, loop.state.time
     limit = setup.time_limit or TASKS[setup.task].time_limit + GRACE_S
     engaged_at = succeeded_at = float("nan")
@@ -310,7 +326,7 @@ def _drive(
         action, record = teleoperation.step(state)
         if record.engaged and np.isnan(engaged_at):
             engaged_at = state.time
-        rows.add(state, view, action.command, record)
+        rows.add(state, action.command, record, view)
         filming.note()
         if watch is not None:
             watch(stage, view, record)

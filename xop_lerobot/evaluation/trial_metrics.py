@@ -22,6 +22,8 @@ from xop_lerobot.evaluation.metrics import (
 )
 from xop_lerobot.evaluation.trial import Trace, Trial
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
+from xop_lerobot.morphology.scene import build_model
+from xop_lerobot.retarget.model.kinematics import SiteKinematics
 
 TOUCH = 0.05
 """Distance at which a palm touches its point, in the paper [m]."""
@@ -64,7 +66,9 @@ def compute_metrics(trial: Trial) -> dict[str, float]:
         "hands_error": float(np.mean([each.mean for each in hands])),
         "hands_error_p95": float(np.mean([each.p95 for each in hands])),
         "roughness": compute_roughness(trace.command[trace.engaged], half, dt),
-        "slip": math.nan if morphology.wheeled else _compute_slip(morphology, trace, dt),
+        "slip": math.nan
+        if morphology.wheeled
+        else compute_slip(compute_feet(morphology, trace.qpos), dt),
         "standing": float(standing.sum() / max(trace.engaged.sum(), 1)),
         "plan_ms": float(np.median(solves)) if solves.size else math.nan,
         "plan_p99_ms": float(np.percentile(solves, 99)) if solves.size else math.nan,
@@ -152,17 +156,13 @@ def _compute_palm_metrics(trial: Trial) -> dict[str, float]:
     }
 
 
-def _compute_slip(morphology: Morphology, trace: Trace, dt: float) -> float:
-    model = morphology.build_spec("planning").compile()
-    data = mujoco.MjData(model)
-    groups = [[model.site(name).id for name in group] for group in morphology.contact_groups]
-    feet = np.empty((len(trace.time), len(groups), 3))
-    for row, qpos in enumerate(trace.qpos):
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        for column, sites in enumerate(groups):
-            feet[row, column] = data.site_xpos[sites].mean(axis=0)
-    return compute_slip(feet, dt)
+def compute_feet(morphology: Morphology, qpos: np.ndarray) -> np.ndarray:
+    """Find the middle of each foot or wheel. Shape (n, nq) -> (n, f, 3)."""
+    model, groups = build_model(morphology, "planning"), morphology.contact_groups
+    points = tuple(point for group in groups for point in group)
+    poses = SiteKinematics(model, points).compute_poses(qpos)
+    feet = [np.mean([poses[point][:, :3] for point in group], axis=0) for group in groups]
+    return np.stack(feet, axis=1) if feet else np.zeros((len(qpos), 0, 3))
 
 
 def _compute_touch(trace: Trace, dt: float) -> float:
