@@ -176,55 +176,48 @@ def add_device(delays: Delays, origin: Any) -> None:
 
 def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
     """Let the sender drive the robot in real time until it is gone."""
-    from xop_lerobot.low_level.factory import make_policy
+    from xop_lerobot.evaluation.trial import closed_loop
     from xop_lerobot.morphology.morphology import make_morphology
     from xop_lerobot.operator.devices import DeviceConfig
     from xop_lerobot.plant.config import SimulationConfig
-    from xop_lerobot.plant.policy_loop import PolicyLoop
     from xop_lerobot.plant.simulation import Simulation
     from xop_lerobot.retarget.config import RetargeterConfig
-    from xop_lerobot.session import RobotInfo
-    from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+    from xop_lerobot.teleoperation import TeleoperationConfig
 
-    robot, low_level, fps = settings.robot, POLICIES[settings.robot], settings.fps
+    low_level, fps = POLICIES[settings.robot], settings.fps
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    morphology = make_morphology(robot)
-    plant = Simulation(morphology, SimulationConfig(), kind="planning")
-    loop = PolicyLoop(morphology, plant, make_policy(low_level))
+    plant = Simulation(make_morphology(settings.robot), SimulationConfig(), kind="planning")
     config = TeleoperationConfig(
         device=DeviceConfig(type="measured", port=port, code=CODE, max_delay_s=5.0, stale_s=1.0),
         retargeter=RetargeterConfig(type=settings.retargeter),
     )
-    info = RobotInfo(f"xop_{robot}", morphology, low_level, None, "empty", fps, 0, realtime=True)
-    teleoperation = Teleoperation(config, info)
-    teleoperation.connect()
-    loop.reset(seed=0, settle_s=0.8)
-    device: Any = teleoperation.device
-    arguments: tuple[Any, ...] = (port, settings.seconds, settings.rate)
-    send = send_frames
-    if settings.sender == "browser":
-        send, arguments = send_from_browser, (*arguments, origin)
-    page = SPAWN.Process(target=send, args=arguments)
-    page.start()
-    due = time.monotonic()
-    while page.is_alive():
-        begun = time.thread_time()
-        action, record = teleoperation.step(loop.state)
-        now = time.monotonic()
-        if record.engaged:
-            delays.tick_work.append(time.thread_time() - begun)
-        if record.engaged and record.frame is not None and record.frame.time in delays.sent:
-            delays.command.append(now - delays.sent[record.frame.time])
-            delays.told.append(device.status.delay or 0.0)
-        loop.execute(action, 1 / fps)
-        due = max(due + 1 / fps, time.monotonic() - 1)
-        wait = due - time.monotonic()
-        delays.late_ticks += wait < 0
-        time.sleep(max(wait, 0))
-    page.join()
-    teleoperation.disconnect()
-    loop.close()
+    with closed_loop(plant, config, low_level, fps=fps, realtime=True) as (loop, teleoperation):
+        teleoperation.connect()
+        loop.reset(seed=0, settle_s=0.8)
+        device: Any = teleoperation.device
+        arguments: tuple[Any, ...] = (port, settings.seconds, settings.rate)
+        send = send_frames
+        if settings.sender == "browser":
+            send, arguments = send_from_browser, (*arguments, origin)
+        page = SPAWN.Process(target=send, args=arguments)
+        page.start()
+        due = time.monotonic()
+        while page.is_alive():
+            begun = time.thread_time()
+            action, record = teleoperation.step(loop.state)
+            now = time.monotonic()
+            if record.engaged:
+                delays.tick_work.append(time.thread_time() - begun)
+            if record.engaged and record.frame is not None and record.frame.time in delays.sent:
+                delays.command.append(now - delays.sent[record.frame.time])
+                delays.told.append(device.status.delay or 0.0)
+            loop.execute(action, 1 / fps)
+            due = max(due + 1 / fps, time.monotonic() - 1)
+            wait = due - time.monotonic()
+            delays.late_ticks += wait < 0
+            time.sleep(max(wait, 0))
+        page.join()
 
 
 def main() -> None:

@@ -27,18 +27,16 @@ from xop_lerobot.core.transforms import (
     quat_from_yaw,
     rotation_error,
 )
-from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.evaluation.trial import closed_loop
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.plant.config import SimulationConfig
-from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.model.posture import Repertoire
 from xop_lerobot.retarget.mpc import MpcRetargeter
-from xop_lerobot.session import RobotInfo
-from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+from xop_lerobot.teleoperation import TeleoperationConfig
 
 NEAR_M, NEAR_DEG = 0.05, 5.0
 LOWEST, MOST_TILTED = 0.5, 100.0
@@ -107,43 +105,38 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
 
     morphology = make_morphology(args.robot)
-    low_level = morphology.policies[0]
     plant = Simulation(morphology, SimulationConfig(noise=args.noise, seed=args.seed))
-    loop = PolicyLoop(morphology, plant, make_policy(low_level))
-    info = RobotInfo(args.robot, morphology, low_level, None, SimulationConfig().scene, 25, 0)
     config = TeleoperationConfig(retargeter=RetargeterConfig(threads=1))
-    teleoperation = Teleoperation(config, info)
-    loop.reset(args.seed)
-    retargeter = teleoperation.retargeter
-    assert isinstance(retargeter, MpcRetargeter)
+    with closed_loop(plant, config) as (loop, teleoperation):
+        loop.reset(args.seed)
+        retargeter = teleoperation.retargeter
+        assert isinstance(retargeter, MpcRetargeter)
 
-    def measure() -> dict[str, np.ndarray]:
-        return retargeter.problem.readings.compute_poses(loop.state.true_qpos, morphology.frames)
+        def measure() -> dict[str, np.ndarray]:
+            return retargeter.problem.readings.compute_poses(loop.state.true_qpos, morphology.frames)
 
-    frames = measure()
-    head = frames.pop("head")
-    device = teleoperation.device = Head(head, frames)
-    teleoperation.alignment = WorldAlignment()
-    teleoperation.reset()
-    missed = 0
-    for i, goal in enumerate(draw_goals(retargeter, args.goals, args.seed)):
-        device.head = goal
-        for _ in range(round(args.hold * info.fps)):
-            action, _ = teleoperation.step(loop.state)
-            loop.execute(action, 1 / info.fps)
-        reached = measure()["head"]
-        away = float(np.linalg.norm(reached[:3] - goal[:3]))
-        turned = float(np.degrees(np.linalg.norm(rotation_error(goal[3:], reached[3:]))))
-        failed = away > NEAR_M or turned > NEAR_DEG
-        missed += failed
-        verdict = "missed" if failed else "reached"
-        print(f"goal {i}: {verdict}, {away * 100:.1f} cm and {turned:.1f} deg away", flush=True)
-        if loop.state.fallen:
-            print("the robot has fallen")
-            break
-    print(f"{args.robot}: {missed} of {args.goals} goals missed")
-    teleoperation.disconnect()
-    loop.close()
+        frames = measure()
+        head = frames.pop("head")
+        device = teleoperation.device = Head(head, frames)
+        teleoperation.alignment = WorldAlignment()
+        teleoperation.reset()
+        missed = 0
+        for i, goal in enumerate(draw_goals(retargeter, args.goals, args.seed)):
+            device.head = goal
+            for _ in range(round(args.hold / teleoperation.dt)):
+                action, _ = teleoperation.step(loop.state)
+                loop.execute(action, teleoperation.dt)
+            reached = measure()["head"]
+            away = float(np.linalg.norm(reached[:3] - goal[:3]))
+            turned = float(np.degrees(np.linalg.norm(rotation_error(goal[3:], reached[3:]))))
+            failed = away > NEAR_M or turned > NEAR_DEG
+            missed += failed
+            verdict = "missed" if failed else "reached"
+            print(f"goal {i}: {verdict}, {away * 100:.1f} cm and {turned:.1f} deg away", flush=True)
+            if loop.state.fallen:
+                print("the robot has fallen")
+                break
+        print(f"{args.robot}: {missed} of {args.goals} goals missed")
     return 1 if missed or loop.state.fallen else 0
 
 

@@ -39,9 +39,8 @@ from xop_lerobot.core.transforms import (
     pose_multiply,
     quat_from_yaw,
 )
-from xop_lerobot.evaluation.trial import TraceRows
+from xop_lerobot.evaluation.trial import TraceRows, closed_loop
 from xop_lerobot.evaluation.trial_metrics import compute_feet
-from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
@@ -51,7 +50,6 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
-from xop_lerobot.session import RobotInfo
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 TRACE_DT = 0.2
@@ -198,15 +196,12 @@ def run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory
 def _run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory]:
     scenario = get_scenario(setup.scenario)
     morphology = make_tuned_morphology(setup)
-    low_level = resolve_policy(morphology, setup.low_level)
-    path = setup.low_level_path or None
     config = SimulationConfig(scene=scenario.scene, noise=setup.resolved_noise, seed=seed)
     plant = Simulation(morphology, config, model=make_loaded_model(morphology, setup, config.scene))
-    loop = PolicyLoop(morphology, plant, make_policy(low_level, path))
-    info = RobotInfo(morphology.name, morphology, low_level, path, scenario.scene, setup.fps, seed)
-    retargeter = make_retargeter_config(setup, seed)
-    teleoperation = Teleoperation(TeleoperationConfig(retargeter=retargeter), info)
-    try:
+    teleoperated = TeleoperationConfig(retargeter=make_retargeter_config(setup, seed))
+    policy = (setup.low_level, setup.low_level_path)
+    with closed_loop(plant, teleoperated, *policy, fps=setup.fps, seed=seed) as pair:
+        loop, teleoperation = pair
         # What is put into the hands makes a robot sink and lean before it has found its balance.
         loop.reset(seed, settle_s=LOADED_SETTLE_S if setup.payload else SETTLE_S)
         frames = locate_frames(morphology, loop.state.true_qpos)
@@ -219,9 +214,6 @@ def _run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajector
         teleoperation.alignment = WorldAlignment()
         teleoperation.reset()
         return track, _drive(loop, teleoperation, track)
-    finally:
-        teleoperation.disconnect()
-        loop.close()
 
 
 def _drive(loop: PolicyLoop, teleoperation: Teleoperation, track: GoalTrack) -> Trajectory:

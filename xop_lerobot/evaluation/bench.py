@@ -18,6 +18,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -40,7 +41,7 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
 )
 from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
-from xop_lerobot.low_level.factory import make_policy, resolve_policy
+from xop_lerobot.evaluation.trial import closed_loop
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.goal import GoalVelocity
@@ -52,8 +53,7 @@ from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.rollout import PolicyRollout
 from xop_lerobot.retarget.sync.state_sync import StateSync
-from xop_lerobot.session import RobotInfo
-from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
+from xop_lerobot.teleoperation import TeleoperationConfig
 
 LEAD_IN_S = 1.0
 """Time for which the first goal is the pose at home [s]."""
@@ -185,8 +185,6 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
         UnknownName: If a name in `config` is unknown.
     """
     morphology = make_morphology(config.robot)
-    low_level = resolve_policy(morphology, config.low_level)
-    path = config.low_level_path or None
     settings = RetargeterConfig(
         num_samples=config.samples,
         horizon=config.horizon,
@@ -194,21 +192,17 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
         preset=config.preset,
         seed=config.seed,
     )
-    info = RobotInfo("bench", morphology, low_level, path, config.scene, 50, config.seed)
-    plant = SimulationConfig(scene=config.scene, noise=config.noise, seed=config.seed)
-    loop = PolicyLoop(morphology, Simulation(morphology, plant), make_policy(low_level, path))
-    teleoperation = Teleoperation(TeleoperationConfig(retargeter=settings), info)
-    retargeter = teleoperation.retargeter
-    assert isinstance(retargeter, MpcRetargeter)
-    bare = BareRollout(retargeter.rollout, settings.num_threads)
-    try:
-        loop.reset(config.seed)
-        sync = StateSync(morphology, retargeter.rollout.model)
-        rows = _time_solves(config, loop, retargeter, sync, bare)
-    finally:
-        bare.close()
-        teleoperation.disconnect()
-        loop.close()
+    sensors = SimulationConfig(scene=config.scene, noise=config.noise, seed=config.seed)
+    plant, policy = Simulation(morphology, sensors), (config.low_level, config.low_level_path)
+    teleoperated = TeleoperationConfig(retargeter=settings)
+    with closed_loop(plant, teleoperated, *policy, fps=50, seed=config.seed) as pair:
+        loop, teleoperation = pair
+        retargeter = teleoperation.retargeter
+        assert isinstance(retargeter, MpcRetargeter)
+        with closing(BareRollout(retargeter.rollout, settings.num_threads)) as bare:
+            loop.reset(config.seed)
+            sync = StateSync(morphology, retargeter.rollout.model)
+            rows = _time_solves(config, loop, retargeter, sync, bare)
     used = retargeter.configs[config.mode]
     return {
         **summarise(rows),
@@ -219,7 +213,7 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
         "threads": settings.num_threads,
         "wanted_hz": used.control_hz,
         "physics_steps": used.num_samples * used.horizon * retargeter.rollout.substeps,
-        "low_level": low_level,
+        "low_level": teleoperation.info.low_level,
         "preset": config.preset,
         "scene": config.scene,
         "noise": config.noise,

@@ -7,7 +7,8 @@ loop but without LeRobot: nothing waits, nothing is recorded, and the same seed 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -16,12 +17,13 @@ import numpy as np
 
 from xop_lerobot.core.state import FRAMES, RobotState
 from xop_lerobot.evaluation.methods import make_retargeter_config, resolve_low_level
-from xop_lerobot.low_level.factory import make_policy
-from xop_lerobot.morphology.morphology import Morphology, make_morphology
+from xop_lerobot.low_level.factory import make_policy, resolve_policy
+from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.operator.devices import DeviceConfig
 from xop_lerobot.operator.display import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
+from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.plan import Status
 from xop_lerobot.session import RobotInfo, TickRecord
 from xop_lerobot.tasks.task import TASKS, TaskStatus, make_task
@@ -263,13 +265,28 @@ def make_stage(setup: TrialSetup, seed: int) -> Stage:
     return Stage(make_morphology(setup.robot), setup.task, config, setup.heights)
 
 
-def make_teleoperation(setup: TrialSetup, seed: int, morphology: Morphology) -> Teleoperation:
-    """Make the simulated person and the method of a resolved `setup`."""
-    path = setup.low_level_path or None
-    info = RobotInfo(setup.robot, morphology, setup.low_level, path, setup.scene, setup.fps, seed)
-    retargeter = make_retargeter_config(morphology, setup.method, setup.variant, seed)
-    device = DeviceConfig(type="simulated", seed=seed)
-    return Teleoperation(TeleoperationConfig(device=device, retargeter=retargeter), info)
+@contextmanager
+def closed_loop(
+    plant: Simulation,
+    config: TeleoperationConfig,
+    low_level: str = "",
+    low_level_path: str = "",
+    *,
+    fps: int = 25,
+    seed: int = 0,
+    realtime: bool = False,
+) -> Iterator[tuple[PolicyLoop, Teleoperation]]:
+    """Make a teleoperation that drives a simulated robot; a tick is `step`, then `execute`."""
+    morphology, path = plant.morphology, low_level_path or None
+    name, scene = resolve_policy(morphology, low_level), plant.config.scene
+    info = RobotInfo(morphology.name, morphology, name, path, scene, fps, seed, realtime)
+    loop = PolicyLoop(morphology, plant, make_policy(name, path))
+    teleoperation = Teleoperation(config, info)
+    try:
+        yield loop, teleoperation
+    finally:
+        teleoperation.disconnect()
+        loop.close()
 
 
 def run_trial(
@@ -291,18 +308,20 @@ def run_trial(
     begin = perf_counter()
     setup = setup.resolved
     stage = make_stage(setup, seed)
-    policy = make_policy(setup.low_level, setup.low_level_path or None)
-    loop = PolicyLoop(stage.plant.morphology, stage.plant, policy)
-    teleoperation = make_teleoperation(setup, seed, stage.plant.morphology)
-    try:
+    config = TeleoperationConfig(
+        device=DeviceConfig(type="simulated", seed=seed),
+        retargeter=make_retargeter_config(
+            stage.plant.morphology, setup.method, setup.variant, seed
+        ),
+    )
+    policy = (setup.low_level, setup.low_level_path)
+    with closed_loop(stage.plant, config, *policy, fps=setup.fps, seed=seed) as pair:
+        loop, teleoperation = pair
         teleoperation.connect()
         loop.reset(seed, start=stage.start)
         stage.reset(seed)
         teleoperation.reset(stage.obstacles)
         return _drive(setup, seed, stage, loop, teleoperation, begin, watch)
-    finally:
-        teleoperation.disconnect()
-        loop.close()
 
 
 def _drive(
