@@ -22,14 +22,14 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NoReturn
+from typing import Any
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 
 from xop_lerobot.core.command import Mode, RobotAction
-from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.command_line import CommandParser, make_output_readable
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.core.transforms import (
@@ -323,21 +323,9 @@ def print_profile(figures: Mapping[str, Any]) -> None:
     print(f"{'bare rollout':<18} {figures['rollout_ms_median']:8.2f}")
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are the project's own."""
-
-    def error(self, message: str) -> NoReturn:
-        raise BadValue(message)
-
-
-def make_parser() -> argparse.ArgumentParser:
+def make_parser() -> CommandParser:
     """Make the parser of the command line."""
-    parser = _Parser(
-        prog="xop-bench",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("xop-bench", __doc__)
     add = parser.add_argument
     defaults = {each.name: each.default for each in dataclasses.fields(BenchConfig)}
     add("--robot", required=True, help="g1 or rby1")
@@ -377,11 +365,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[BenchConfig, argparse.Nam
         BadValue: If a flag is unknown, absent or malformed; an unknown one lists the known.
         UnknownName: If a mode or preset is unknown, listing the known ones.
     """
-    parser = make_parser()
-    args, unknown = parser.parse_known_args(arguments)
-    if unknown:
-        flags = [flag for action in parser._actions for flag in action.option_strings]
-        raise UnknownName("flag of xop-bench", unknown[0], [f for f in flags if f[:2] == "--"])
+    args = make_parser().parse(arguments)
     modes = {mode.name.lower(): mode for mode in Mode}
     if args.mode not in modes:
         raise UnknownName("mode", args.mode, modes)
