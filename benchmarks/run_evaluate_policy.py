@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.command_line import make_output_readable, split_pair
 from xop_lerobot.core.errors import BadValue, XopError
 
 if TYPE_CHECKING:
@@ -40,9 +40,10 @@ def read_rollouts(texts: list[str], at: float) -> dict[str, Hands]:
 
     found: dict[str, Hands] = {}
     for text in texts:
-        name, _, root = text.partition("=")
-        if not name or not root or name in found:
-            raise BadValue(f"--rollouts takes NAME=DIRECTORY, each name once, got '{text}'")
+        form = "--rollouts takes NAME=DIRECTORY, each name once"
+        name, root = split_pair(text, form)
+        if name in found:
+            raise BadValue(f"{form}, got '{text}'")
         found[name] = read_hands(Path(root), at)
     first, *others = found.items()
     for name, hands in others:

@@ -14,6 +14,7 @@ from typing import Any
 from unittest.mock import patch
 
 from xop_lerobot.core.command import Mode
+from xop_lerobot.core.command_line import split_pair
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.low_level.policy import POLICY_DT
@@ -360,12 +361,7 @@ def parse_overrides(settings: Sequence[str]) -> dict[str, Any]:
     """Read settings ``name=value``, the value as YAML reads it.
 
     Raises:
-        BadValue: If one has no ``=``.
+        BadValue: If one is no such pair.
     """
-    overrides = {}
-    for setting in settings:
-        name, separator, value = setting.partition("=")
-        if not separator:
-            raise BadValue(f"a setting reads name=value, got '{setting}'")
-        overrides[name] = load_yaml(value, switches=True)
-    return overrides
+    pairs = (split_pair(setting, "a setting reads name=value") for setting in settings)
+    return {name: load_yaml(value, switches=True) for name, value in pairs}

@@ -21,12 +21,9 @@ from pathlib import Path
 from xop_lerobot.collect.config import CollectConfig, add_config, add_crew, read_config
 from xop_lerobot.collect.folder import CollectFolder
 from xop_lerobot.collect.run import WorkerFailed, run_collection
-from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, make_output_readable
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C or SIGTERM."""
 
 
 @dataclass(frozen=True)

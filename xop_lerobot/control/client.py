@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from xop_lerobot.control.protocol import MAX_LINE, find_socket, read_object, write_object
-from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.command_line import make_output_readable, split_pair
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.paced_log import PacedLog
 
@@ -89,42 +89,21 @@ class ControlClient:
         self.close()
 
 
-def parse_pairs(kind: str, pairs: Sequence[str]) -> dict[str, str]:
-    """Read `name=value` pairs.
-
-    Raises:
-        BadValue: If one has no `=`.
-    """
-    values = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not (name and equals and value):
-            raise BadValue(f"--{kind} takes name=value, got {pair!r}")
-        values[name] = value
-    return values
-
-
 def build_request(flags: argparse.Namespace) -> dict[str, Any]:
     """Build the request that the flags ask for.
 
     Raises:
-        BadValue: If a value is neither a number nor a switch where it must be.
+        BadValue: If a pair is none, or a value neither a number nor a switch where it must be.
     """
     request: dict[str, Any] = {
         name: getattr(flags, name)
         for name in ("preset", "variant", "mode", "targets", "body", "toggle")
         if getattr(flags, name) is not None
     }
-    if flags.weights:
-        request["weights"] = {
-            name: _to_number(name, text)
-            for name, text in parse_pairs("weights", flags.weights).items()
-        }
-    if flags.constraints:
-        request["constraints"] = {
-            name: _to_switch(name, text)
-            for name, text in parse_pairs("constraints", flags.constraints).items()
-        }
+    for name, read in (("weights", _to_number), ("constraints", _to_switch)):
+        if pairs := getattr(flags, name):
+            split = dict(split_pair(pair, f"--{name} takes name=value") for pair in pairs)
+            request[name] = {key: read(key, text) for key, text in split.items()}
     return request or {"get": "settings"}
 
 

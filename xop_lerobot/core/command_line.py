@@ -103,6 +103,8 @@ class CommandParser(argparse.ArgumentParser):
         return parsed
 
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C or SIGTERM, as shells have it."""
 TRACEBACK_VARIABLE = "XOP_TRACEBACK"
 _COMMANDS = ("lerobot-", "lerobot_")
 
@@ -136,6 +138,22 @@ def report_mistakes() -> None:
 
     report.xop_stock = stock  # pyright: ignore[reportFunctionMemberAccess]
     sys.excepthook = report
+
+
+def split_pair(text: str, form: str) -> tuple[str, str]:
+    """Split `NAME=VALUE`, both without blanks around them.
+
+    Args:
+        text: What was given.
+        form: What must be given, as a message begins: `--part takes NAME=SHARE`.
+
+    Raises:
+        BadValue: If either is missing.
+    """
+    name, _, value = (part.strip() for part in text.partition("="))
+    if not (name and value):
+        raise BadValue(f"{form}, got '{text}'")
+    return name, value
 
 
 def say_count(count: int, noun: str) -> str:

@@ -19,13 +19,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.command_line import (
+    INTERRUPTED,
+    CommandParser,
+    make_output_readable,
+    split_pair,
+)
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 
 logger = logging.getLogger(__name__)
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 DEFAULT_TRIALS = 20
 
 
@@ -129,13 +132,7 @@ def make_study(args: argparse.Namespace) -> list[Any]:
 
 def _parse_paths(text: str) -> dict[str, str]:
     """Read `name=path` with commas between."""
-    paths = {}
-    for part in text.split(","):
-        name, equals, path = (piece.strip() for piece in part.partition("="))
-        if not (name and equals and path):
-            raise BadValue(f"--low-level-path must be NAME=PATH, got '{part}'")
-        paths[name] = path
-    return paths
+    return dict(split_pair(part, "--low-level-path must be NAME=PATH") for part in text.split(","))
 
 
 def _choose(

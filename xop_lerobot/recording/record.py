@@ -44,7 +44,7 @@ from lerobot.utils.visualization_utils import (
 from lerobot_robot_xop import XopRobotConfig
 from lerobot_teleoperator_xop import XopConfig
 from lerobot_teleoperator_xop.terminal import listen_while_recording
-from xop_lerobot.core.command_line import make_output_readable
+from xop_lerobot.core.command_line import INTERRUPTED, make_output_readable
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm
 from xop_lerobot.morphology.morphology import list_robot_types
@@ -58,9 +58,6 @@ if TYPE_CHECKING:
     from lerobot_teleoperator_xop.xop import Xop
 
 logger = logging.getLogger(__name__)
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C or SIGTERM."""
 
 
 @dataclass

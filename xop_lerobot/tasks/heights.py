@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from xop_lerobot.core.command_line import split_pair
 from xop_lerobot.core.errors import BadValue, UnknownName
 
 type HeightRange = tuple[float, float]
@@ -24,13 +25,13 @@ def parse_heights(text: str) -> dict[str, HeightRange]:
     """
     heights: dict[str, HeightRange] = {}
     for part in filter(None, (piece.strip() for piece in text.strip("{} ").split(","))):
-        name, equals, numbers = (piece.strip() for piece in part.partition("="))
+        name, numbers = split_pair(part, f"heights must be {_FORM}")
         first, colon, second = numbers.partition(":")
         try:
             low, high = float(first), float(second if colon else first)
         except ValueError:
             low = high = math.nan
-        if not (name and equals and math.isfinite(low) and math.isfinite(high)):
+        if not (math.isfinite(low) and math.isfinite(high)):
             raise BadValue(f"heights must be {_FORM}, got '{part}'")
         if name in heights:
             raise BadValue(f"heights give '{name}' twice")
