@@ -20,11 +20,9 @@ import numpy as np
 from benchmarks.tracking import WorldAlignment
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import (
-    compute_heading,
-    make_pose,
+    level_pose,
     pose_inverse,
     pose_multiply,
-    quat_from_yaw,
     rotation_error,
 )
 from xop_lerobot.evaluation.trial import closed_loop
@@ -56,7 +54,7 @@ class Head(Device):
 
     def __init__(self, head: np.ndarray, wrists: dict[str, np.ndarray]) -> None:
         self.head = head
-        level = pose_inverse(_level(head))
+        level = pose_inverse(level_pose(head))
         self._from_head = {name: pose_multiply(level, pose) for name, pose in wrists.items()}
 
     def start(self, time: float) -> None:
@@ -64,14 +62,12 @@ class Head(Device):
 
     def read(self, time: float) -> OperatorFrame:
         """The head where it is, and the hands as they hang on it."""
-        wrists = {name: pose_multiply(_level(self.head), p) for name, p in self._from_head.items()}
+        wrists = {
+            name: pose_multiply(level_pose(self.head), p) for name, p in self._from_head.items()
+        }
         return OperatorFrame(
             time=time, head=self.head, **wrists, pinch=np.full(2, 0.1), mode=self.start_mode
         )
-
-
-def _level(pose: np.ndarray) -> np.ndarray:
-    return make_pose(pose[:3], quat_from_yaw(compute_heading(pose[3:])))
 
 
 def draw_goals(retargeter: MpcRetargeter, count: int, seed: int) -> np.ndarray:

@@ -33,11 +33,10 @@ from benchmarks.tracking_setup import (
 from xop_lerobot.core.errors import UnknownName
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import (
-    compute_heading,
+    level_pose,
     make_pose,
     pose_inverse,
     pose_multiply,
-    quat_from_yaw,
 )
 from xop_lerobot.evaluation.trial import TraceRows, closed_loop
 from xop_lerobot.evaluation.trial_metrics import compute_feet
@@ -77,7 +76,7 @@ class GoalDevice(Device):
     ) -> None:
         self.start_mode = scenario.mode
         self.track = track
-        home = pose_inverse(_level(track.home))
+        home = pose_inverse(level_pose(track.home))
         self._from_head = {name: pose_multiply(home, pose) for name, pose in wrists.items()}
         self._start: float | None = None
 
@@ -109,7 +108,7 @@ class GoalDevice(Device):
         if reach is not None and clock >= self.track.reach_start:
             side = 1.0 if name == "left_wrist" else -1.0
             wrist = make_pose(reach * np.array([1, side, 1]), wrist[3:])
-        return pose_multiply(_level(head), wrist)
+        return pose_multiply(level_pose(head), wrist)
 
 
 class WorldAlignment(Alignment):
@@ -142,10 +141,6 @@ class WorldAlignment(Alignment):
     def goal_poses(self, frame: OperatorFrame) -> dict[str, np.ndarray]:
         """The operator's poses. Shapes (7,)."""
         return {name: frame.pose(name).copy() for name in FRAMES}
-
-
-def _level(pose: np.ndarray) -> np.ndarray:
-    return make_pose(pose[:3], quat_from_yaw(compute_heading(pose[3:])))
 
 
 def locate_frames(morphology: Morphology, qpos: np.ndarray) -> dict[str, np.ndarray]:
@@ -205,8 +200,7 @@ def _run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajector
         # What is put into the hands makes a robot sink and lean before it has found its balance.
         loop.reset(seed, settle_s=LOADED_SETTLE_S if setup.payload else SETTLE_S)
         frames = locate_frames(morphology, loop.state.true_qpos)
-        home = frames["head"]
-        home = make_pose(home[:3], quat_from_yaw(compute_heading(home[3:])))
+        home = level_pose(frames["head"])
         rng = np.random.default_rng((seed, 7))
         track = scenario.build(home, rng, setup.hold, setup.goals)
         wrists = {name: frames[name] for name in FRAMES[1:]}

@@ -186,6 +186,11 @@ def pose_inverse(pose: np.ndarray) -> np.ndarray:
     return make_pose(-quat_rotate(quat, pose[..., :3]), quat)
 
 
+def level_pose(pose: np.ndarray) -> np.ndarray:
+    """Place and heading of a pose, without its tilt. Shape (..., 7)."""
+    return make_pose(pose[..., :3], quat_from_yaw(compute_heading(pose[..., 3:])))
+
+
 def rotation_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
     """Rotation vector log(q_goal q^-1) in world axes [rad]. Shapes (..., 4) -> (..., 3)."""
     return quat_log(quat_multiply(goal, quat_conjugate(quat)))

@@ -12,6 +12,7 @@ from xop_lerobot.core.errors import BadShape, BadValue, UnknownName, XopError
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import (
     compute_heading,
+    level_pose,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -183,7 +184,7 @@ class Alignment:
             reach_scale=self._find_reach_scale(robot_reach) or height_scale,
         )
         # A wrist that is not seen yet is wanted where the robot has it.
-        body = pose_inverse(_level(robot["head"]))
+        body = pose_inverse(level_pose(robot["head"]))
         self._from_head = {
             name: pose_multiply(body, robot[name]) for name in self.config.frames if name != "head"
         }
@@ -217,7 +218,7 @@ class Alignment:
     def _compute_goals(self, anchor: _Anchor, frame: OperatorFrame) -> dict[str, np.ndarray]:
         head = _compute_head(anchor, frame.head, self.config.walk_scale)
         goals = {"head": head}
-        level = _level(head)
+        level = level_pose(head)
         for name in self.config.frames:
             if name == "head":
                 continue
@@ -266,11 +267,6 @@ def _compute_head(anchor: _Anchor, head: np.ndarray, walk_scale: float) -> np.nd
     since = quat_multiply(head[3:], quat_conjugate(anchor.operator[3:]))
     rotation = quat_multiply(quat_multiply(anchor.turn, since), quat_conjugate(anchor.turn))
     return make_pose(anchor.robot[:3] + travel, quat_multiply(rotation, anchor.robot[3:]))
-
-
-def _level(head: np.ndarray) -> np.ndarray:
-    """The head's place and heading without its nod and tilt. Shape (7,)."""
-    return make_pose(head[:3], quat_from_yaw(compute_heading(head[3:])))
 
 
 def _get_pose(robot_frames: Mapping[str, np.ndarray], name: str) -> np.ndarray:

@@ -11,13 +11,12 @@ import numpy as np
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import (
-    compute_heading,
     compute_minimum_jerk,
+    level_pose,
     make_pose,
     pose_inverse,
     pose_multiply,
     quat_exp,
-    quat_from_yaw,
     quat_multiply,
     rotation_error,
 )
@@ -81,7 +80,7 @@ class HandBlend:
             robot: Poses of its frames, robot world. Shapes (7,).
         """
         self.reset()
-        body = pose_inverse(_level(head))
+        body = pose_inverse(level_pose(head))
         for name in FRAMES[1:]:
             if name in robot:
                 self._last[name] = pose_multiply(body, robot[name])
@@ -103,7 +102,7 @@ class HandBlend:
         blended = dict(goals)
         if "head" not in goals:
             return blended
-        level = _level(goals["head"])
+        level = level_pose(goals["head"])
         for name, seen in zip(FRAMES[1:], tracked[1:], strict=True):
             if name in goals:
                 goal = pose_multiply(pose_inverse(level), goals[name])
@@ -150,11 +149,6 @@ class HandBlend:
 def _compute_offset(pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """Offset of a pose from a goal, along the axes of both. Shape (6,)."""
     return np.concatenate([pose[:3] - goal[:3], rotation_error(pose[3:], goal[3:])])
-
-
-def _level(head: np.ndarray) -> np.ndarray:
-    """The head's place and heading without its nod and tilt. Shape (7,)."""
-    return make_pose(head[:3], quat_from_yaw(compute_heading(head[3:])))
 
 
 @dataclass

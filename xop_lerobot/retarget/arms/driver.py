@@ -16,13 +16,12 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.state import FRAMES, Goal, RobotState
 from xop_lerobot.core.transforms import (
-    compute_heading,
+    level_pose,
     make_pose,
     pose_inverse,
     pose_multiply,
     quat_exp,
     quat_from_matrix,
-    quat_from_yaw,
     quat_multiply,
     rotation_error,
 )
@@ -62,16 +61,11 @@ def compute_wrist_goals(
     wrists = {name: pose for name, pose in goals.items() if name != "head"}
     if "head" not in goals:
         return wrists
-    carry = pose_multiply(_level(head), pose_inverse(_level(goals["head"])))
+    carry = pose_multiply(level_pose(head), pose_inverse(level_pose(goals["head"])))
     return {
         name: _approach(pose_multiply(carry, pose), pose, max_offset, max_turn)
         for name, pose in wrists.items()
     }
-
-
-def _level(pose: np.ndarray) -> np.ndarray:
-    """Place and heading of a pose, without its tilt. Shape (7,)."""
-    return make_pose(pose[:3], quat_from_yaw(compute_heading(pose[3:])))
 
 
 def _approach(start: np.ndarray, end: np.ndarray, max_offset: float, max_turn: float) -> np.ndarray:

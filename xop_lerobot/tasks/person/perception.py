@@ -9,6 +9,7 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import (
     compute_heading,
+    level_pose,
     make_pose,
     pose_inverse,
     pose_multiply,
@@ -273,6 +274,5 @@ def _measure_reach(view: View) -> float:
 def _measure_hand(view: View) -> np.ndarray:
     """Left wrist from the head along its heading, over the head's height. Shape (7,)."""
     head = view.frames["head"]
-    level = make_pose(head[:3], quat_from_yaw(compute_heading(head[3:])))
-    wrist = pose_multiply(pose_inverse(level), view.frames["left_wrist"])
+    wrist = pose_multiply(pose_inverse(level_pose(head)), view.frames["left_wrist"])
     return make_pose(wrist[:3] / head[2], wrist[3:])
