@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from xop_lerobot.core.errors import BadShape
 from xop_lerobot.core.transforms import pose_multiply, quat_exp
 from xop_lerobot.curate import quality
-from xop_lerobot.evaluation.metrics import summarise_errors
+from xop_lerobot.evaluation.metrics import compute_pose_errors, summarise_errors
 
 DT = 0.04
 
@@ -38,14 +38,14 @@ def stand(n: int) -> np.ndarray:
 def test_errors_are_the_offset_that_was_put_in():
     goal = make_poses(50)
     offset = np.array([0.03, 0, 0.04, *quat_exp(np.array([0, 0.2, 0]))])
-    distance, angle = quality.compute_pose_errors(pose_multiply(goal, offset), goal)
+    distance, angle = compute_pose_errors(pose_multiply(goal, offset), goal)
     assert distance == pytest.approx(0.05)
     assert angle == pytest.approx(0.2)
 
 
 def test_errors_of_equal_poses_are_zero_whatever_the_sign_of_the_quaternion():
     pose = make_poses(20)
-    distance, angle = quality.compute_pose_errors(pose, pose * [1, 1, 1, -1, -1, -1, -1])
+    distance, angle = compute_pose_errors(pose, pose * [1, 1, 1, -1, -1, -1, -1])
     assert distance == pytest.approx(0)
     assert angle == pytest.approx(0, abs=1e-7)
 
@@ -68,7 +68,7 @@ def test_tracking_of_nothing_is_nan():
 
 def test_wrong_shapes_are_named():
     with pytest.raises(BadShape, match=r"goal must have shape \(3, 7\), got \(4, 7\)"):
-        quality.compute_pose_errors(stand(3), stand(4))
+        compute_pose_errors(stand(3), stand(4))
     with pytest.raises(BadShape, match=r"pose must have shape \(3, 7\), got \(4, 7\)"):
         quality.find_idle([stand(4)], np.ones(3, bool), DT)
     with pytest.raises(BadShape, match=r"path must have shape \('n', 'k'\), got \(4,\)"):

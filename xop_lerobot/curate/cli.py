@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from typing import Protocol, cast
 
-from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, make_output_readable
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm
 
@@ -64,8 +64,6 @@ def load_verb(name: str) -> Verb:
     return cast("Verb", importlib.import_module(f"{_PACKAGE}.{VERBS[name]}"))
 
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C or SIGTERM, as shells have it."""
 WRONG_USAGE = 2
 """Exit code of a command line that is not understood."""
 

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from xop_lerobot.core.command_line import CommandParser, say_count
+from xop_lerobot.core.command_line import CommandParser, say_count, split_pair
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.curate.arguments import (
     add_destination,
@@ -95,10 +95,7 @@ class FrameRules:
         self._rules: list[Expression] = []
         self.names: list[str] = []
         for text in texts:
-            name, equals, expression = text.partition("=")
-            name = name.strip()
-            if not equals or not name or not expression.strip():
-                raise BadValue(f"--subtask takes {_FORM}, got '{text}'")
+            name, expression = split_pair(text, f"--subtask takes {_FORM}")
             self._rules.append(Expression(expression, kinds))
             if name not in self.names:
                 self.names.append(name)

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from xop_lerobot.collect.folder import write_whole
 from xop_lerobot.core.errors import BadValue
+from xop_lerobot.core.folders import write_whole
 
 
 @dataclass(frozen=True)

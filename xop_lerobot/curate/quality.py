@@ -23,7 +23,6 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from xop_lerobot.core.errors import BadShape
 from xop_lerobot.core.transforms import quat_rotate
-from xop_lerobot.evaluation import metrics
 from xop_lerobot.evaluation.metrics import NEVER, find_runs
 
 STILL_WINDOW_S = 0.5
@@ -37,7 +36,6 @@ LDLJ_WINDOW_S = 2.0
 """Length of the pieces that smoothness is computed of [s]: about that of one movement."""
 LATE_FACTOR = 1.5
 """A frame is late if it came this many periods after the one before."""
-compute_pose_errors = metrics.compute_pose_errors
 
 
 class GapFigures(NamedTuple):

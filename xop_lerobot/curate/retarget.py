@@ -23,10 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from xop_lerobot.collect.config import add_config, add_crew, read_config
-from xop_lerobot.collect.folder import CollectFolder, FolderTaken, write_whole
+from xop_lerobot.collect.folder import CollectFolder
 from xop_lerobot.collect.run import Collection, run_collection
-from xop_lerobot.core.command_line import CommandParser, say_count
+from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, say_count
 from xop_lerobot.core.errors import BadDataset, BadValue, XopError
+from xop_lerobot.core.folders import FolderTaken, write_whole
 from xop_lerobot.curate.arguments import add_source
 from xop_lerobot.curate.clip import PROVENANCE, Step, name_source
 from xop_lerobot.curate.retarget_job import (
@@ -44,8 +45,6 @@ from xop_lerobot.recording.facts import FACTS_DIR
 
 SUMMARY = "replay the operators with another robot, retargeter or policy"
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C or SIGTERM, as shells have it."""
 _FIGURES = {
     "duration": "time [s]",
     "tracking_head_mean": "head [m]",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from xop_lerobot.collect.config import CollectConfig, import_plugins
+from xop_lerobot.core.command_line import split_pair
 from xop_lerobot.core.errors import BadDataset, BadRecording, BadValue, UnknownName
 from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.curate.clip import PROVENANCE, Clip, Step, make_facts
@@ -255,11 +256,9 @@ def split_pairs(what: str, pairs: Sequence[str]) -> list[tuple[str, Any]]:
 
     found = []
     for pair in pairs:
-        name, equals, text = pair.partition("=")
-        if not equals:
-            raise BadValue(f"{what} must be given as KEY=VALUE, got '{pair}'")
+        name, text = split_pair(pair, f"{what} must be given as KEY=VALUE")
         try:
-            found.append((name.strip(), load_yaml(text, switches=True)))
+            found.append((name, load_yaml(text, switches=True)))
         except yaml.YAMLError as error:
             raise BadValue(f"{what} '{name}': '{text}' cannot be read") from error
     return found

@@ -29,7 +29,7 @@ from xop_lerobot.curate.measures import (
     has_column,
 )
 from xop_lerobot.curate.source import EpisodeEntry
-from xop_lerobot.evaluation.metrics import find_runs
+from xop_lerobot.evaluation.metrics import compute_pose_errors, find_runs
 
 POSE = 7
 MOST_ENTRIES = 32
@@ -233,7 +233,7 @@ def _build_goals(episode: Episode) -> list[Panel]:
                 Series("robot", robot[:, place]),
             )
             panels.append(Panel(f"{name} {axis}", "m", curves))
-        distance, angle = quality.compute_pose_errors(robot, goal)
+        distance, angle = compute_pose_errors(robot, goal)
         distances.append(Series(name, _mask(distance, known), colour=index))
         angles.append(Series(name, _mask(angle, known), colour=index))
     panels.append(Panel("distance from the goal", "m", tuple(distances)))
