@@ -1,5 +1,5 @@
 # Everything starts here, and nothing has to be installed before: `make demo` or `make test`.
-# The first run makes .venv (see docs/setup.md); later runs start at once.
+# The first run makes .venv (see docs/start/setup.md); later runs start at once.
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python

@@ -2,9 +2,9 @@
 
     python -m benchmarks.run_compare_operator recording.npz ... --seeds 4 --plot comparison.png
 
-The recordings are of real people, in the format of docs/operator.md; the simulated person touches
-two points with a robot without physics that follows within 0.3 s. Recordings of walking hold no
-long standing, so sway is compared where the head is slow.
+The recordings are of real people, in the format of docs/how_it_works/operator.md; the simulated
+person touches two points with a robot without physics that follows within 0.3 s. Recordings of
+walking hold no long standing, so sway is compared where the head is slow.
 """
 
 from __future__ import annotations

@@ -4,10 +4,11 @@ r"""Print how near a policy's hands come to their points, beside others' in the 
         untrained=outputs/rollout_untrained
 
 Each of --rollouts is a dataset that `lerobot-rollout` recorded with a robot of this project, in a
-task that has two points (docs/training.md). All must be of the same seeds: the first is compared
-with each of the others, with a robot that stands still, and with the best that goes to the same
-places in every episode, found with hindsight. With --margin the exit code is 1 unless it is nearer
-than the others and the one that stands still by so much, at the lower end of the 95% interval.
+task that has two points (docs/use/training.md). All must be of the same seeds: the first is
+compared with each of the others, with a robot that stands still, and with the best that goes to the
+same places in every episode, found with hindsight. With --margin the exit code is 1 unless it is
+nearer than the others and the one that stands still by so much, at the lower end of the 95%
+interval.
 """
 
 from __future__ import annotations

@@ -147,7 +147,7 @@ def make_motion(kind: Kind, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Make an operator recording of one kind: stand, crouch, stand up, stand.
 
     Returns:
-        The arrays of an operator recording (docs/operator.md), at 50 Hz.
+        The arrays of an operator recording (docs/how_it_works/operator.md), at 50 Hz.
     """
     down, low, up = rng.uniform(0.7, 1.0), rng.uniform(0.1, 0.3), rng.uniform(0.7, 1.0)
     depth = kind.depth * rng.uniform(0.9, 1.1)
@@ -156,7 +156,7 @@ def make_motion(kind: Kind, rng: np.random.Generator) -> dict[str, np.ndarray]:
     lowered = depth * (_rise(t, marks[0], down) - _rise(t, marks[2], up))
 
     def sway(size: float) -> np.ndarray:
-        """Slow movement of somebody who stands; published for quiet standing, docs/operator.md."""
+        """Postural sway of a standing person, as published (docs/how_it_works/operator.md)."""
         rates, phases = rng.uniform(0.1, 0.6, 3), rng.uniform(0, 2 * np.pi, 3)
         return size * np.sin(2 * np.pi * rates * t[:, None] + phases)
 

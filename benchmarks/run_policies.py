@@ -1,7 +1,7 @@
 """Compare G1's low-level policies, alone and under the model predictive controller.
 
     python -m benchmarks.run_policies --policies default falcon openwbt=FOLDER
-    python -m benchmarks.run_policies --policies all=FOLDER --docs docs/low_level.md \
+    python -m benchmarks.run_policies --policies all=FOLDER --docs docs/how_it_works/low_level.md \
         --json outputs/policies.json
 
 A policy is a name, the path of a table of your own, or either with its file or folder behind `=`.

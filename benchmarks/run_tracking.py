@@ -23,7 +23,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from benchmarks.tracking import make_record, run_scenario, run_trial
-from benchmarks.tracking_documents import write_documents
+from benchmarks.tracking_documents import DOCUMENT, write_documents
 from benchmarks.tracking_report import (
     Results,
     describe_run,
@@ -79,7 +79,11 @@ def parse_args(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--json", type=Path, help="results, added to what it holds; also resumes")
     add("--fresh", action="store_true", help="forget what the JSON file holds")
     add("--plot", type=Path, help="draw the first run into this picture and stop")
-    add("--write-docs", action="store_true", help="fill docs/benchmarks.md from --json and stop")
+    add(
+        "--write-docs",
+        action="store_true",
+        help=f"fill {DOCUMENT} from --json and stop",
+    )
     add("--bench", type=Path, nargs="+", default=[], metavar="FILE",
         help="JSON files of xop-bench for --write-docs")  # fmt: skip
     args = parser.parse_args(arguments)

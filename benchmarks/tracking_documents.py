@@ -1,4 +1,4 @@
-"""Fills the tables of docs/benchmarks.md from the results of the benchmarks."""
+"""Fills the tables of docs/results/benchmarks.md from the results of the benchmarks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from benchmarks.tracking_setup import (
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.evaluation.bench_report import describe_versions, make_bench_blocks
 
-DOCUMENT = Path("docs/benchmarks.md")
+DOCUMENT = Path("docs/results/benchmarks.md")
 ROBOTS = ("g1", "rby1")
 PLOTTED = ("stationary", "mobile", "curve")
 VARIANTS = {
@@ -50,7 +50,7 @@ ASKED = (
 
 
 def write_documents(root: Path, results: Path, benches: Sequence[Path] = ()) -> list[str]:
-    """Put tables of results between the markers of docs/benchmarks.md.
+    """Put tables of results between the markers of docs/results/benchmarks.md.
 
     Runs that were made with settings which are no longer the robots' own are left out.
 
@@ -75,7 +75,7 @@ def write_documents(root: Path, results: Path, benches: Sequence[Path] = ()) -> 
     blocks = make_blocks(runs, machine) if runs else {}
     if benches:
         blocks |= make_bench_blocks([json.loads(path.read_text()) for path in benches])
-    blocks |= draw_plots(document.parent, runs)
+    blocks |= draw_plots(root / "docs", runs)
     document.write_text(fill_document(document.read_text(), blocks))
     lines = [f"written: {document} ({', '.join(blocks)})"]
     if len(runs) < len(everything):
@@ -87,7 +87,7 @@ def draw_plots(folder: Path, runs: Mapping[str, Run]) -> dict[str, str]:
     """Draw the errors of each robot's runs over time, where variants were held as long.
 
     Args:
-        folder: Folder of the document; pictures go to ``images``.
+        folder: Folder of the documents; pictures go to ``images``.
         runs: Runs by key.
 
     Returns:
@@ -103,7 +103,7 @@ def draw_plots(folder: Path, runs: Mapping[str, Run]) -> dict[str, str]:
             continue
         picture = f"images/tracking_{robot}.png"
         if plot_variants(folder / picture, _keep_holds(own, {max(holds)}), robot, names):
-            blocks[f"{robot} plot"] = f"![Position error over time, {robot}]({picture})"
+            blocks[f"{robot} plot"] = f"![Position error over time, {robot}](../{picture})"
     return blocks
 
 

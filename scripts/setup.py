@@ -1,6 +1,6 @@
 """Make `.venv` and install the project in it; started by `setup.sh` with a Python that fits.
 
-Standard library only, since nothing is installed yet. What it does is told in `docs/setup.md`.
+Standard library only, since nothing is installed yet. docs/start/setup.md explains the steps.
 """
 
 from __future__ import annotations

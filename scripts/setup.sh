@@ -5,7 +5,7 @@
 #   sh scripts/setup.sh --print-python only print the interpreter that would be used
 #
 # XOP_PYTHON=/path/to/python chooses the interpreter; XOP_NO_SYSTEM=1 forbids system packages.
-# docs/setup.md says what is done and why.
+# docs/start/setup.md says what is done and why.
 set -eu
 cd "$(dirname "$0")/.."
 

@@ -299,10 +299,10 @@ def test_every_table_and_picture_of_the_document_can_be_filled_and_parses(tmp_pa
     runs = all_runs()
     results = tmp_path / "results.json"
     results.write_text(json.dumps({"machine": {"processor": "P", "cores": "2"}, "runs": runs}))
-    document = tmp_path / "docs" / "benchmarks.md"
-    document.parent.mkdir()
+    document = tmp_path / "docs" / "results" / "benchmarks.md"
+    document.parent.mkdir(parents=True)
     # RB-Y1 is not told to stretch its arms, and G1 sees no walls.
-    text = (ROOT / "docs" / "benchmarks.md").read_text()
+    text = (ROOT / "docs" / "results" / "benchmarks.md").read_text()
     kept = {
         key: run
         for key, run in runs.items()
@@ -317,8 +317,8 @@ def test_every_table_and_picture_of_the_document_can_be_filled_and_parses(tmp_pa
     tables = {name: block for name, block in blocks if name.startswith(ROBOTS)}
     for robot in ROBOTS:
         picture = tables.pop(f"{robot} plot")
-        assert picture == f"![Position error over time, {robot}](images/tracking_{robot}.png)"
-        assert (document.parent / "images" / f"tracking_{robot}.png").stat().st_size > 10_000
+        assert picture == f"![Position error over time, {robot}](../images/tracking_{robot}.png)"
+        assert (tmp_path / "docs" / "images" / f"tracking_{robot}.png").stat().st_size > 10_000
     assert len(tables) >= 14
     for name, block in tables.items():
         assert len(parse_table(block)) >= 1, name
@@ -330,7 +330,7 @@ def kind_of(scenario: str) -> str:
 
 
 def test_the_documents_tables_parse_as_they_are():
-    text = (ROOT / "docs" / "benchmarks.md").read_text()
+    text = (ROOT / "docs" / "results" / "benchmarks.md").read_text()
     begun = re.findall(r"<!-- begin (.*?) -->", text)
     assert begun == re.findall(r"<!-- end (.*?) -->", text)
     assert len(begun) == len(set(begun))
@@ -360,9 +360,9 @@ def test_runs_with_other_settings_are_left_out(tmp_path):
     results = tmp_path / "results.json"
     runs = {key: run, stale: {**run, "seed": 1}, setup.compute_key(0): tuned}
     results.write_text(json.dumps({"machine": {"processor": "P"}, "runs": runs}))
-    document = tmp_path / "docs" / "benchmarks.md"
-    document.parent.mkdir()
-    document.write_text((ROOT / "docs" / "benchmarks.md").read_text())
+    document = tmp_path / "docs" / "results" / "benchmarks.md"
+    document.parent.mkdir(parents=True)
+    document.write_text((ROOT / "docs" / "results" / "benchmarks.md").read_text())
     lines = write_documents(tmp_path, results)
     assert lines[1] == "left out: 2 runs with other settings"
     assert "1 runs; seeds 0 to 0" in document.read_text()

@@ -328,7 +328,7 @@ def test_missing_dataset(tmp_path, capsys):
 
 
 def test_every_figure_is_documented():
-    text = (REPO / "docs" / "curate.md").read_text()
+    text = (REPO / "docs" / "use" / "curate.md").read_text()
     table = text.split("## inspect")[1].split("## filter")[0]
     for name in FIGURES:
         if not name.startswith(("tracking_head", "tracking_left", "tracking_right")):

@@ -204,5 +204,5 @@ def test_idle_is_nobody_driving_or_nobody_moving():
 def test_swaying_person_is_idle():
     t = np.arange(500) * DT
     person = stand(500)
-    person[:, 0] += 0.004 * math.sqrt(2) * np.sin(2 * math.pi * 0.5 * t)  # docs/operator.md
+    person[:, 0] += 0.004 * math.sqrt(2) * np.sin(2 * math.pi * 0.5 * t)  # quiet standing
     assert quality.find_idle([person], np.ones(500, bool), DT).all()

@@ -1,4 +1,4 @@
-"""The newcomer's path of docs/first_steps.md, run command by command."""
+"""The newcomer's path of docs/start/first_steps.md, run command by command."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lerobot.datasets import LeRobotDataset
 
 from tests.docs.test_readme import PAGES, ROOT, read_commands
 
-PAGE = ROOT / "docs" / "first_steps.md"
+PAGE = ROOT / "docs" / "start" / "first_steps.md"
 MODULES = {
     "xop-collect": "xop_lerobot.collect.cli",
     "xop-curate": "xop_lerobot.curate.cli",
@@ -49,5 +49,6 @@ def test_a_newcomer_gets_to_a_policy_that_drives(tmp_path: Path) -> None:
 
 def test_the_index_lists_every_page() -> None:
     index = (ROOT / "docs" / "index.md").read_text()
-    pages = [page for page in PAGES if page.parent.name == "docs" and page.name != "index.md"]
-    assert [page.name for page in pages if f"({page.name}" not in index] == []
+    pages = [page for page in PAGES if page.parent != ROOT and page.name != "index.md"]
+    listed = (f"({page.parent.name}/{page.name}" for page in pages)
+    assert [link for link in listed if link not in index] == []

@@ -23,7 +23,7 @@ from xop_lerobot.evaluation.bench import parse_arguments as parse_bench
 from xop_lerobot.operator.recording import load_recording
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 COMMANDS = re.compile(r"(lerobot-[a-z-]+|xop-[a-z]+|make [a-z]+)\b")
 
 
@@ -210,7 +210,7 @@ def test_examples_are_python(page: Path) -> None:
         ast.parse(block, str(page))
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/operator.md"])
+@pytest.mark.parametrize("name", ["README.md", "docs/how_it_works/operator.md"])
 def test_the_example_recording_is_one(name: str, tmp_path: Path) -> None:
     (example,) = (block for block in read_blocks(ROOT / name, "python") if "np.savez" in block)
     subprocess.run([sys.executable, "-c", example], cwd=tmp_path, check=True, env=os.environ)

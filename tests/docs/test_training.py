@@ -1,7 +1,7 @@
 """From collected episodes to a policy that drives the robot, with LeRobot's own commands.
 
 What a policy takes in and gives out is exactly the state, the pictures and the action, whatever
-other columns a dataset has. docs/training.md is the same on a larger scale.
+other columns a dataset has. docs/use/training.md is the same on a larger scale.
 """
 
 from __future__ import annotations

@@ -198,6 +198,6 @@ def test_the_tables_of_the_document():
     assert len(lines) == 4
     assert {line.count("|") for line in lines} == {11}
     assert blocks["profile"].splitlines()[2].endswith("| 51.00 |")
-    text = (Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md").read_text()
+    text = (Path(__file__).resolve().parents[2] / "docs" / "results" / "benchmarks.md").read_text()
     for name in blocks:
         assert f"<!-- begin {name} -->" in text

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import ModelKind
     from xop_lerobot.morphology.tuning import MpcConfig
 
+PAGE = Path(__file__).parents[2] / "docs" / "how_it_works" / "simulation.md"
+
 TOY = """
 <mujoco model="toy">
   <worldbody>
@@ -630,7 +632,7 @@ def test_browser_meshes_are_as_large_as_the_geoms(robot: str) -> None:
 
 
 def test_the_documented_example_runs() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(block, names)
@@ -639,7 +641,7 @@ def test_the_documented_example_runs() -> None:
 
 
 def test_the_documented_settings_are_the_real_ones() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     documented = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| `.*?\|", page, re.MULTILINE))))
     settings = {setting.name for setting in fields(NoiseConfig)}
     assert settings == documented & settings

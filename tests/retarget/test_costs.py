@@ -513,8 +513,8 @@ def test_a_sample_costs_the_same_alone(cost):
 
 
 def test_the_documented_defaults_are_the_real_ones():
-    """docs/retargeter.md, table of the terms: `name` in the fourth column from the end."""
-    text = (Path(__file__).parents[2] / "docs" / "retargeter.md").read_text()
+    """Table of the terms in the retargeter's page: `name` in the fourth column from the end."""
+    text = (Path(__file__).parents[2] / "docs" / "how_it_works" / "retargeter.md").read_text()
     documented = {}
     for row in text.splitlines():
         cells = [cell.strip() for cell in row.strip("|").split("|")]
@@ -523,8 +523,8 @@ def test_the_documented_defaults_are_the_real_ones():
     defaults = CostWeights()
     actual = {f.name: getattr(defaults, f.name) for f in dataclasses.fields(CostWeights)}
     used = {name for name, value in actual.items() if value}
-    assert used <= set(documented), "docs/retargeter.md lacks a weight of CostWeights"
-    assert documented.items() <= actual.items(), "docs/retargeter.md is behind CostWeights"
+    assert used <= set(documented), "retargeter.md lacks a weight of CostWeights"
+    assert documented.items() <= actual.items(), "retargeter.md is behind CostWeights"
 
 
 def test_datasets_list_the_terms_in_an_order_that_stays():

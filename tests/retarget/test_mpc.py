@@ -459,8 +459,8 @@ def test_a_goal_that_runs_away_is_held_near(bench):
 
 
 def test_the_documented_parameters_are_the_real_ones():
-    """docs/retargeter.md, table of the parameters: one row each, G1 and RB-Y1, both modes."""
-    text = (Path(__file__).parents[2] / "docs" / "retargeter.md").read_text()
+    """Table of the parameters in the retargeter's page: a row each, G1 and RB-Y1, both modes."""
+    text = (Path(__file__).parents[2] / "docs" / "how_it_works" / "retargeter.md").read_text()
     configs = [make_morphology(name).mpc_config(mode) for name in POLICIES for mode in Mode]
     seen = 0
     for row in text.splitlines():
@@ -472,6 +472,6 @@ def test_the_documented_parameters_are_the_real_ones():
             value = config
             for name in path:
                 value = getattr(value, name)
-            assert float(cell) == value, f"docs/retargeter.md: {cells[0]} of {config}"
+            assert float(cell) == value, f"retargeter.md: {cells[0]} of {config}"
             seen += 1
     assert seen >= 24

@@ -104,7 +104,7 @@ def make_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def make_bench_blocks(benches: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Blocks of docs/benchmarks.md: the machine, the figures, and where the time goes.
+    """Blocks of docs/results/benchmarks.md: the machine, the figures, and where the time goes.
 
     Args:
         benches: Contents of JSON files of xop-bench, a row each.

@@ -135,7 +135,7 @@ method; sensors with noise; success decided by the physics. Counts are out of al
 Wilson's 95% interval; means have their standard deviation and, small, the 95% interval of the mean
 by a bootstrap. CT is over successful trials. ABP: mean over the ticks in standing mode and over
 legs and waist of |torque × velocity|; in brackets with its sign. Tilt and jerk: of the carrying
-palm until 10 cm from the opening. Every figure is defined in docs/evaluation.md.</p>
+palm until 10 cm from the opening. Every figure is defined in docs/results/evaluation.md.</p>
 <p class="note"><b>Rows in brown are the paper's own (10 trials, human operators, a real headset;
 Tables II to IV).</b> Its rooms, points and people are not ours: compare methods within a table,
 not rows across.</p>

@@ -1,8 +1,8 @@
 r"""What a table says of a low-level policy: networks, what they see, what their outputs move.
 
-A table is a TOML file. docs/own_policy.md explains every key by an example; the structs below are
-its grammar, and msgspec checks a file against them: an unknown key, a wrong type or a missing entry
-is named with its place.
+A table is a TOML file. docs/use/own_policy.md explains every key by an example; the structs below
+are its grammar, and msgspec checks a file against them: an unknown key, a wrong type or a missing
+entry is named with its place.
 
 Joints are named by patterns (``"*_knee_joint"``) or by the groups of `joints.GROUPS`; where numbers
 go by joint, the last pattern that fits counts.

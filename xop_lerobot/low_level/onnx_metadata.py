@@ -67,7 +67,7 @@ def make_table(
     raise PolicyFileError(
         f"policy file '{file}' does not describe itself: it holds neither mjlab's "
         "observation_names nor holosoma's dof_names, kp and kd. Describe it by a table, see "
-        "docs/own_policy.md"
+        "docs/use/own_policy.md"
     )
 
 

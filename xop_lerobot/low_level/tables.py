@@ -78,7 +78,7 @@ def read_table(file: Path) -> d.PolicyTable:
             terms = sorted(_tag(term) for term in (*get_args(d.Seen.__value__), d.Past))
             hint = f". Known terms: {', '.join(terms)}"
         elif "unknown field" in str(error):
-            hint = ". docs/own_policy.md lists the keys"
+            hint = ". docs/use/own_policy.md lists the keys"
         raise PolicyFileError(f"policy table '{file}': {error}{hint}") from error
 
 

@@ -17,7 +17,7 @@ CONTROL_REFERENCES = ("proposal", "neutral", "zero")
 
 @dataclass(frozen=True)
 class CostWeights:
-    """Weights of the cost terms (Eq. 3); docs/retargeter.md has the formulas.
+    """Weights of the cost terms (Eq. 3); docs/how_it_works/retargeter.md has the formulas.
 
     Attributes:
         position: w_p, squared position error of each tracked frame [1/m²].

@@ -167,7 +167,7 @@ class View:
         engaged: Whether the operator drives, as the display shows it.
         fallen: Whether the robot has fallen.
         success: Whether the task is accomplished.
-        hints: What a person who has practised the task knows, by name (docs/tasks.md) [m].
+        hints: What a person who has practised the task knows, by name (docs/use/tasks.md) [m].
     """
 
     time: float

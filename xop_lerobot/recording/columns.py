@@ -25,7 +25,7 @@ HEALTH_NAMES = (
     "solve_time", "plan_age", "effective_samples", "status", "sync_residual", "sync_status",
     "intervention", "risk",
 )  # fmt: skip
-"""Entries of `retargeter.health`; docs/recording.md says what they mean."""
+"""Entries of `retargeter.health`; docs/use/recording.md says what they mean."""
 OWN_PREFIXES = ("operator.", "goal.", "retargeter.", "robot.", "time.", "next.")
 """What the keys of these columns begin with."""
 

@@ -233,7 +233,7 @@ class BadObstacles(XopError, ValueError):
 
 
 def load_obstacles(path: str | Path) -> tuple[Obstacle, ...]:
-    """Read obstacles; docs/retargeter.md has the format.
+    """Read obstacles; docs/how_it_works/retargeter.md has the format.
 
     Raises:
         BadObstacles: Naming the file, the entry and its fault.

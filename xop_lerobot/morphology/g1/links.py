@@ -1,6 +1,7 @@
 """G1, 29 degrees of freedom, the revision of 35.1 kg that FALCON was trained on: its numbers.
 
-Published by the maker (29-DoF description, BSD-3-Clause) and used by FALCON; see docs/models.md.
+Published by the maker (29-DoF description, BSD-3-Clause) and used by FALCON; see
+docs/how_it_works/models.md.
 """
 
 from xop_lerobot.morphology.links import Joint, Link

@@ -1,4 +1,7 @@
-"""RB-Y1 A v1.2: its numbers, as in the maker's URDF (rby1-sdk, Apache-2.0); see docs/models.md."""
+"""RB-Y1 A v1.2: its numbers, as in the maker's URDF (rby1-sdk, Apache-2.0).
+
+See docs/how_it_works/models.md.
+"""
 
 from xop_lerobot.morphology.links import Joint, Link
 

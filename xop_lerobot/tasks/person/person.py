@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Person:
-    """Parameters of one person; `docs/operator.md` has the sources.
+    """Parameters of one person; `docs/how_it_works/operator.md` has the sources.
 
     Attributes:
         eye_height: Height of the eyes over the floor, standing [m].
