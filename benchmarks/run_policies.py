@@ -1,8 +1,8 @@
 """Compare G1's low-level policies, alone and under the model predictive controller.
 
     python -m benchmarks.run_policies --policies default falcon openwbt=FOLDER
-    python -m benchmarks.run_policies --policies all=FOLDER --docs docs/how_it_works/low_level.md \
-        --json outputs/policies.json
+    python -m benchmarks.run_policies --policies all=FOLDER \
+        --docs docs/results/low_level_policies.md --json outputs/policies.json
 
 A policy is a name, the path of a table of your own, or either with its file or folder behind `=`.
 Parts: `speed` of one call; plain `commands` held for 10 s; `arms` held anywhere; random
