@@ -309,9 +309,7 @@ def test_sigterm_ends_in_one_line(orders, tmp_path, capsys):
     assert main([*FLAGS, f"--root={root}", "--episodes=4", "--workers=1"]) == 130
     printed = capsys.readouterr()
     assert printed.out == ""
-    assert printed.err.splitlines()[-1] == (
-        "stopped; the same command goes on with the finished episodes"
-    )
+    assert printed.err.splitlines()[-1] == ("interrupted; run the same command again to resume")
     assert not list(tmp_path.iterdir())
 
 
@@ -320,7 +318,7 @@ def test_a_worker_that_dies_is_replaced(serial, orders, tmp_path, capsys):
     (orders / "die-1").touch()
     collect(CONFIG, tmp_path / "data", 2, workers=1)
     assert (
-        "episode 0: the worker process died (signal SIGKILL); once more" in capsys.readouterr().err
+        "episode 0: the worker process died (signal SIGKILL); retrying" in capsys.readouterr().err
     )
     assert len(read_facts(tmp_path / "data")) == 2
 
@@ -541,7 +539,7 @@ def test_flags():
 def test_help_states_units_and_defaults():
     text = " ".join(make_parser().format_help().split())
     assert "rate of control and dataset [Hz]; divides 50 (default: 25)" in text
-    assert "cameras, with commas between (default: head)" in text
+    assert "cameras, comma-separated (default: head)" in text
     for action in make_parser()._actions:
         assert action.help
 
@@ -568,8 +566,8 @@ def test_a_full_disk_ends_in_a_line(tmp_path, capsys, monkeypatch):
     flags = ["--robot=g1", "--task=dual_point_touch", "--episodes=1", f"--root={tmp_path}/a"]
     assert main(flags) == 1
     assert capsys.readouterr().err == (
-        "error: [Errno 28] No space left on device: 'data/file-000.parquet'. The same command goes "
-        "on with what is finished\n"
+        "error: [Errno 28] No space left on device: 'data/file-000.parquet'. Run the same "
+        "command again to resume\n"
     )
 
 

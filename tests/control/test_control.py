@@ -112,7 +112,9 @@ REFUSALS = {
     '{"body": ["tail"]}': "unknown part of the body 'tail'. Known: left_arm_0,",
     '{"toggle": "lights"}': "unknown constraint or preset 'lights'. Known: aggressive,",
     '{"get": "weather"}': "'get' must be 'settings', got 'weather'",
-    '{"get": "settings", "mode": "mobile"}': "'get' stands alone in a request, got get, mode",
+    '{"get": "settings", "mode": "mobile"}': (
+        "'get' must be the only key of a request, got get, mode"
+    ),
 }
 
 

@@ -305,7 +305,7 @@ def test_episodes_that_cannot_be_replayed_are_left_out(source, tmp_path, capsys)
     # Once the source is mended, the same command adds what was left out.
     shutil.copy(source / "data/chunk-000/file-002.parquet", root / "data/chunk-000")
     assert retarget(root, out, "--workers=1") == 0
-    assert "1 episode is there already" in capsys.readouterr().err
+    assert "1 episode already done, skipping" in capsys.readouterr().err
     origins = [facts["provenance"][-1]["source_episode"] for facts in read_facts(out)]
     assert origins == [1, 2]
 
@@ -408,10 +408,10 @@ def test_stopped_runs_go_on(made, source, tmp_path, capsys, monkeypatch):
     first = next(RetargetFolder(out).work.glob("attempts/[0-9]*/attempt.json"))
     written = json.loads(first.read_text())
     assert capsys.readouterr().err.splitlines()[-1] == (
-        "stopped; the same command goes on with the finished episodes"
+        "interrupted; run the same command again to resume"
     )
     assert retarget(source, out, "--workers=1") == 0
-    assert "1 episode is there already" in capsys.readouterr().err
+    assert "1 episode already done, skipping" in capsys.readouterr().err
     attempts = json.loads((out / "meta/xop/retarget.json").read_text())["attempts"]
     assert attempts[0] == written
     assert not RetargetFolder(out).work.exists()

@@ -122,14 +122,14 @@ def test_ports():
         taken.listen(1)
         found = check_ports(Setup(port=port))
         assert found.level is Level.FAIL
-        assert found.text.startswith(f"port {port} at 127.0.0.1 cannot be listened at: ")
+        assert found.text.startswith(f"port {port} at 127.0.0.1 cannot be opened: ")
         assert check_ports(Setup("avp", "127.0.0.1", port)).text == (
             f"127.0.0.1 answers at port {port}"
         )
     found = check_ports(Setup("avp", "127.0.0.1", port))
     assert found.level is Level.FAIL
     assert found.advice.startswith("open Tracking Streamer in the headset and press Start")
-    assert check_ports(Setup("avp")).advice == "give it: --host ADDRESS"
+    assert check_ports(Setup("avp")).advice == "pass --host ADDRESS"
     assert check_ports(Setup("webxr", "192.0.2.7", port)).level is Level.FAIL  # nobody's
 
 
@@ -153,7 +153,7 @@ def test_certificate(tmp_path, monkeypatch):
     get_certificate(now=past)
     found = check_certificate(lan)
     assert found.level is Level.WARN
-    assert found.advice == "headsets ask once more whether they shall trust it"
+    assert found.advice == "headsets will ask again whether to trust it"
 
 
 # -- a headset -----------------------------------------------------------------------------
@@ -217,7 +217,7 @@ def test_a_headset_that_streams():
 def test_a_slow_stream_and_a_lost_hand():
     slow = measure(rate=8)
     assert slow.level is Level.FAIL
-    assert slow.advice.startswith("the robot would be let go again and again")
+    assert slow.advice.startswith("the robot would be disengaged repeatedly")
     lost = measure(one_hand=True)
     assert lost.level in (Level.WARN, Level.FAIL)
     assert lost.figures["seen"]["left"] < 0.5
@@ -227,8 +227,8 @@ def test_a_slow_stream_and_a_lost_hand():
 def test_hands_that_are_shown_too_seldom():
     found = measure(hand_rate=8, seconds=1.5)
     assert found.level is Level.FAIL
-    assert "tells where your hands are only" in found.text
-    assert found.advice.startswith("hold both hands before you, in good light")
+    assert "updates your hands only" in found.text
+    assert found.advice.startswith("hold both hands in front of you, in good light")
     assert 3 < found.figures["hand_rates_hz"]["left"] < 12.5
 
 
@@ -309,7 +309,7 @@ def test_head_room_of_the_planner(monkeypatch, median, slow, level):
     assert found.text.startswith(f"a plan for rby1, mobile, takes {median:.1f} ms of the 40 ms")
     assert found.figures["period_ms"] == 40
     if found.advice:
-        assert found.advice.endswith("Other programs are busy on this machine: end them first.")
+        assert found.advice.endswith("Other programs are using the CPU: close them first.")
 
 
 @pytest.fixture
@@ -336,14 +336,14 @@ def test_what_it_prints(fake_checks, capsys):
         "OK    well         all is well\n"
         "WARN  so_so        it is slow\n"
         "                   → wait\n"
-        "\nready: 0 of 2 checks failed, 1 with a drawback\n"
+        "\nready: 0 of 2 checks failed, 1 with a warning\n"
     )
     assert cli.main(["--only=bad,broken", "--robot", "rby1"]) == 1
     assert capsys.readouterr().out == (
         "FAIL  bad          no rby1\n"
         "                   → buy one\n"
         "FAIL  broken       RuntimeError: oh\n"
-        "\nnot ready: 2 of 2 checks failed, 0 with a drawback\n"
+        "\nnot ready: 2 of 2 checks failed, 0 with a warning\n"
     )
 
 

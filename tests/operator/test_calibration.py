@@ -122,7 +122,7 @@ def test_a_file_and_back(tmp_path):
         with pytest.raises(BadValue) as error:
             load_calibration(path)
         assert str(error.value).startswith(f"calibration '{path}' cannot be used: {fault}")
-        assert str(error.value).endswith("Calibrate anew with lerobot-calibrate, or delete it")
+        assert str(error.value).endswith("Calibrate again with lerobot-calibrate, or delete it")
 
 
 # -- how it is used ------------------------------------------------------------------------

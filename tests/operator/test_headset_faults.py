@@ -141,7 +141,7 @@ def test_faults_that_stop(make_rig, name):
         assert not rig.is_engaged, what
         np.testing.assert_allclose(rig.compute_head(), head, atol=0.03, err_msg=what)
         assert rig.teleop.notice == (
-            "Disengaged: the headset no longer sees where the head is, or is silent. The robot "
+            "Disengaged: the headset has lost its position, or sends nothing. The robot "
             "holds; engage again by the gesture."
         )
         held = rig.ticks[-1][0].arms

@@ -89,12 +89,12 @@ FAULTS = {
     ),
     "an hour's jump of the clock": (
         {"t": np.array([0.0, 0.1, 0.2, 3600.3, 3600.4])},
-        "t must be in seconds, from a clock that nobody sets: its steps may be up to 60 s long, "
+        "t must be in seconds, from a monotonic clock: its steps may be up to 60 s long, "
         "but t[2] = 0.2 s is followed by t[3] = 3600.3 s",
     ),
     "milliseconds since 1970": (
         {"t": 1.7e12 + 1e5 * np.arange(5)},
-        "t must be in seconds, from a clock that nobody sets: its steps may be up to 60 s long, "
+        "t must be in seconds, from a monotonic clock: its steps may be up to 60 s long, "
         "but t[0] = 1.7e+12 s is followed by t[1] = 1.7000001e+12 s",
     ),
     "coordinates of a map": (

@@ -245,7 +245,7 @@ def test_recordings_ask_nothing_of_the_recording_that_is_made_now():
 def test_every_gesture_is_explained():
     assert explain_gestures(GestureConfig()) == {
         "engage": "Turn both palms up, pinch with both hands, and hold still for 1 s; the same "
-        "lets go",
+        "gesture disengages",
         "mode": "Pinch twice with the left hand",
         "end": "Raise the right hand, palm away from you, pinch there, and hold still for 1 s",
         "redo": "Raise the left hand, palm away from you, pinch there, and hold still for 2 s",

@@ -49,7 +49,7 @@ def test_hands_and_head_that_are_not_seen():
     assert warn(tracked=(1, 0, 1)) == ("Your left hand is not seen: its arm stands still.",)
     assert warn(tracked=(1, 1, 0), engaged=False) == ("Your right hand is not seen.",)
     assert warn(tracked=(1, 0, 0)) == ("Your hands are not seen: the arms stand still.",)
-    assert warn(tracked=(0, 0, 0)) == ("The headset does not see where it is, or sends nothing.",)
+    assert warn(tracked=(0, 0, 0)) == ("The headset has lost its position, or sends nothing.",)
     # Where the device knows better, that is told.
     assert warn(tracked=(0, 0, 0), trouble="it was taken off") == ("it was taken off",)
 
@@ -73,7 +73,7 @@ def test_a_slow_stream():
     for i in range(12):
         now = 1 + i / 12
         device.receive(make_frame(now, (0.001 * i, 0, 1.6)))
-    assert warn(device=device) == ("Only 12 poses arrive in a second: gestures need 25.",)
+    assert warn(device=device) == ("Only 12 poses per second arrive: gestures need 25.",)
 
 
 def watch_hands(left_hz: float, right_hz: float, seconds: float = 2.0) -> list[tuple[str, ...]]:
@@ -105,13 +105,13 @@ def watch_hands(left_hz: float, right_hz: float, seconds: float = 2.0) -> list[t
 
 @pytest.mark.parametrize(
     ("left_hz", "right_hz", "hands", "hz"),
-    [(9, 9, "hands are", 9), (9, 90, "left hand is", 9), (90, 11, "right hand is", 11)],
+    [(9, 9, "hands", 9), (9, 90, "left hand", 9), (90, 11, "right hand", 11)],
 )
 def test_hands_that_are_shown_too_seldom(left_hz, right_hz, hands, hz):
     assert set(watch_hands(left_hz, right_hz)) == {
         (
-            f"The headset tells where your {hands} only {hz} times a second; they are followed "
-            "from 13 on. Hold them in view, in good light, and end other apps.",
+            f"The headset updates your {hands} only {hz} times a second; at least 13 are needed. "
+            "Hold them in view, in good light, and close other apps.",
         )
     }
 

@@ -467,7 +467,7 @@ def test_port_that_is_taken(device):
     with pytest.raises(
         PortTaken,
         match=rf"cannot listen at 127.0.0.1 port {device.port}: .*Choose another "
-        "--teleop.device.port, or end the session that has it",
+        "--teleop.device.port, or end the session that uses it",
     ):
         other.connect()
     other.disconnect()

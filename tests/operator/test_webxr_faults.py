@@ -285,7 +285,7 @@ def test_connections_that_end(make_rig):
     ends = {
         take_off: "the headset was taken off",
         load_anew: "the page has closed the connection",
-        send_too_much: "the page was shut out: a message may have 8192 bytes",
+        send_too_much: "the page was disconnected: a message may have 8192 bytes",
         cut: "the page has closed the connection",
     }
     for end, told in ends.items():

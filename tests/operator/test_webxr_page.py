@@ -407,7 +407,7 @@ def test_a_hidden_page_lets_go(desk, open_at):
           document.dispatchEvent(new Event('visibilitychange'));
         }"""
     )
-    wait_text(page, "trouble", "This page was hidden, and the robot was let go. Engage again.")
+    wait_text(page, "trouble", "This page was hidden, and the robot was disengaged. Engage again.")
     wait_for(lambda: not desk.engaged, "the end")
 
 

@@ -115,7 +115,7 @@ def test_monitors_look_on(device):
     monitors = [Page(device, "monitor") for _ in range(4)]
     for monitor in monitors:
         monitor.wait_for("welcome")
-    assert find_refusal(Page(device, "monitor")) == "too many monitors; 4 may look on"
+    assert find_refusal(Page(device, "monitor")) == "too many monitors; 4 may watch"
     assert find_refusal(Page(device, "pilot")) == "role must be operator or monitor"
     monitors[0].send(encode(make_person(0.0), 1, monitors[0].clock()))
     assert find_refusal(monitors[0]) == "monitors look on"
@@ -142,7 +142,7 @@ def test_pages_of_others_are_kept_out(device):
     [
         ("x" * 8193, "a message may have 8192 bytes"),
         ("ü" * 5000, "a message may have 8192 bytes"),
-        (b"\x00\x01", "only text is taken here"),
+        (b"\x00\x01", "only text messages are accepted"),
     ],
 )
 def test_what_may_not_be_sent_ends_the_connection(device, message, reason):
@@ -152,7 +152,7 @@ def test_what_may_not_be_sent_ends_the_connection(device, message, reason):
     page.send(message)
     assert find_refusal(page) == reason
     wait_for(lambda: not device.status.connected)
-    assert device.status.trouble == f"the page was shut out: {reason}"
+    assert device.status.trouble == f"the page was disconnected: {reason}"
     assert not device.read(0.0).tracked.any()
 
 

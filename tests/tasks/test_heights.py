@@ -117,11 +117,11 @@ def test_heights_are_read():
 @pytest.mark.parametrize(
     ("heights", "fault"),
     [
-        ("support", "heights must be NAME=HEIGHT or NAME=LOW:HIGH [m], with commas between, got "
+        ("support", "heights must be NAME=HEIGHT or NAME=LOW:HIGH [m], comma-separated, got "
          "'support'"),
-        ("support=low", "heights must be NAME=HEIGHT or NAME=LOW:HIGH [m], with commas between, "
+        ("support=low", "heights must be NAME=HEIGHT or NAME=LOW:HIGH [m], comma-separated, "
          "got 'support=low'"),
-        ("support=nan", "heights must be NAME=HEIGHT or NAME=LOW:HIGH [m], with commas between, "
+        ("support=nan", "heights must be NAME=HEIGHT or NAME=LOW:HIGH [m], comma-separated, "
          "got 'support=nan'"),
         ("support=0.5:0.4", "heights of 'support' must go from low to high, got 0.5:0.4"),
         ("table=0.5,table=0.5", "heights give 'table' twice"),

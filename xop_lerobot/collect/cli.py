@@ -78,7 +78,7 @@ def collect(
     )
     attempts = collection.attempts
     if not folder.root.exists():
-        print(f"no episode succeeded: '{root}' is not made", file=sys.stderr)
+        print(f"no episode succeeded: '{root}' was not written", file=sys.stderr)
     return CollectResult(
         episodes=len(attempts),
         successes=sum(attempt.success for attempt in attempts),
@@ -99,7 +99,7 @@ def make_parser() -> CommandParser:
         required=True,
         help="dual_point_touch, dual_point_reach, box_pick_and_place or non_prehensile_transport",
     )
-    add("--episodes", required=True, type=int, help="how many episodes there shall be")
+    add("--episodes", required=True, type=int, help="total number of episodes")
     add("--root", required=True, type=Path, help="directory of the dataset")
     add(
         "--repo-id",
@@ -114,7 +114,7 @@ def make_parser() -> CommandParser:
         default=device,
         help=f"operator device: simulated, or one of a plugin (default: {device})",
     )
-    add("--only-successful", action="store_true", help="leave episodes without success out")
+    add("--only-successful", action="store_true", help="leave failed episodes out of the dataset")
     return parser
 
 
@@ -138,13 +138,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with stop_on_sigterm():
             result = collect(config, args.root, args.episodes, args.repo_id, args.workers, args.ray)
     except KeyboardInterrupt:
-        print("stopped; the same command goes on with the finished episodes", file=sys.stderr)
+        print("interrupted; run the same command again to resume", file=sys.stderr)
         return INTERRUPTED
     except XopError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, WorkerFailed) else 2
     except OSError as error:  # a full disk, for example
-        print(f"error: {error}. The same command goes on with what is finished", file=sys.stderr)
+        print(f"error: {error}. Run the same command again to resume", file=sys.stderr)
         return 1
     print(json.dumps(vars(result)))
     return 0

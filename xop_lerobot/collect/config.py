@@ -204,21 +204,21 @@ def add_config(
             options.setdefault("type", find_text)
         parser.add_argument(f"--{name}", help=text, default=default, **options)
 
-    add("seed", "seed of all that is random", type=int)
-    add("cameras", "cameras, with commas between", type=split)
+    add("seed", "seed of everything random", type=int)
+    add("cameras", "cameras, comma-separated", type=split)
     add("low-level", "low-level policy; default: the robot's own")
     add("low-level-path", "file of the low-level policy; empty: its default")
     add("fps", "rate of control and dataset [Hz]; divides 50", type=int)
-    add("width", "width of a picture [pixel]", type=int)
-    add("height", "height of a picture [pixel]", type=int)
-    add("noise", "noise of the sensors: off, mild or harsh")
+    add("width", "image width [pixel]", type=int)
+    add("height", "image height [pixel]", type=int)
+    add("noise", "sensor noise: off, mild or harsh")
     add("method", "mpc, mpc_no_sync, mpc_table1, direct or direct_amo")
     add("variant", "binding, constraints and preset with _ between, such as v2_upright")
     add("scene", "scene; empty: the task's own")
     add("heights", "heights over the task's own, as support=0.35,table=0.6:0.7 [m]")
-    add("plugins", "modules to import first, with commas between", type=split)
+    add("plugins", "modules to import first, comma-separated", type=split)
     parser.add_argument(
-        "--images", action="store_true", help="store pictures as PNG and not as h264 video"
+        "--images", action="store_true", help="store images as PNG instead of h264 video"
     )
 
 
@@ -231,7 +231,7 @@ def add_crew(parser: CommandParser) -> None:
         "--ray",
         default="",
         metavar="ADDRESS",
-        help="make the episodes on a Ray cluster: local, auto, HOST:PORT or ray://HOST:PORT "
+        help="run the episodes on a Ray cluster: local, auto, HOST:PORT or ray://HOST:PORT "
         "(default: none)",
     )
 

@@ -81,7 +81,7 @@ def make_attempts(
         for result in results:
             index = get_index(result.job)
             if result.again:
-                print(f"episode {index}: {result.error}; once more", file=sys.stderr)
+                print(f"episode {index}: {result.error}; retrying", file=sys.stderr)
             elif result.error:
                 raise WorkerFailed(f"episode {index}: {result.error}")
             else:
@@ -193,14 +193,13 @@ def run_collection(
         made = make_attempts(config, folder, make_jobs(missing), workers, begin, ray)
         with _Progress(config, len(missing), quiet=quiet) as progress, closing(made):
             if done:
-                are = "is" if len(done) == 1 else "are"
-                progress.say(f"{say_count(len(done), 'episode')} {are} there already")
+                progress.say(f"{say_count(len(done), 'episode')} already done, skipping")
             for attempt in made:
                 done[attempt.index] = attempt
                 progress.note(attempt)
             are_new = bool(folder.read_attempts().keys() & set(indices))
             if are_new:
-                progress.say("putting the episodes together")
+                progress.say("merging the episodes")
         walls = _compute_walls(folder, done)
 
         def note_walls() -> dict[str, float]:

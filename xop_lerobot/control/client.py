@@ -131,9 +131,11 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--preset", help="default, conservative, aggressive or table1")
     parser.add_argument("--weights", nargs="+", metavar="NAME=VALUE", help="cost weights")
     parser.add_argument("--constraints", nargs="+", metavar="NAME=on|off", help="such as upright")
-    parser.add_argument("--variant", help="binding that the robot names, such as v2")
+    parser.add_argument("--variant", help="named binding of the robot, such as v2")
     parser.add_argument("--targets", nargs="+", help="tracked frames to follow")
-    parser.add_argument("--body", nargs="*", help="what moves for them; none: all commands")
+    parser.add_argument(
+        "--body", nargs="*", help="commands and arm joints that move for them; none: all commands"
+    )
     parser.add_argument("--mode", help="stationary or mobile")
     parser.add_argument("--toggle", help="mode, a constraint, or a preset against default")
     return parser

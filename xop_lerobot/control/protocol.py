@@ -125,7 +125,7 @@ def write_object(values: Mapping[str, Any]) -> bytes:
 def _check_alone(request: Mapping[str, Any], key: str, known: tuple[str, ...] | None) -> None:
     value = request[key]
     if len(request) > 1:
-        raise BadValue(f"{key!r} stands alone in a request, got {', '.join(request)}")
+        raise BadValue(f"{key!r} must be the only key of a request, got {', '.join(request)}")
     if not isinstance(value, str) or (known is not None and value not in known):
         expected = "a name" if known is None else " or ".join(map(repr, known))
         raise BadValue(f"{key!r} must be {expected}, got {value!r:.80}")

@@ -173,7 +173,7 @@ def run(arguments: argparse.Namespace) -> int:
                 make_jobs=operators.read,
             )
         except KeyboardInterrupt:
-            print("stopped; the same command goes on with the finished episodes", file=sys.stderr)
+            print("interrupted; run the same command again to resume", file=sys.stderr)
             return INTERRUPTED
     report(folder.root, collection, arguments.json)
     return 0

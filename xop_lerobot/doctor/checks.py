@@ -67,7 +67,7 @@ class Level(Enum):
 
     OK = "ok"
     WARN = "warn"
-    """It works, with a drawback."""
+    """It works, with a warning."""
     FAIL = "fail"
     """It does not work."""
     SKIP = "skip"
@@ -161,18 +161,18 @@ def check_gl(setup: Setup) -> Finding:
     if not answer.ok:
         return Finding(
             Level.FAIL,
-            f"no pictures (tried: {tried}): {answer.text}",
+            f"no images (tried: {tried}): {answer.text}",
             "install Mesa's EGL (apt-get install libegl1 libgl1-mesa-dri), "
             + (f"or unset MUJOCO_GL={variable}" if variable else "or record without cameras"),
         )
     took, name = answer.text.split("|", 1)
     figures = {"picture_ms": float(took), "renderer": name, "backend": tried.split(",")[0]}
-    text = f"a picture of 640 x 480 takes {took} ms ({tried.split(',')[0]}, {name})"
+    text = f"an image of 640 x 480 takes {took} ms ({tried.split(',')[0]}, {name})"
     if any(word in name.lower() for word in ("llvmpipe", "softpipe", "swrast")):
         return Finding(
             Level.WARN,
             f"{text}; no graphics card is used",
-            "smaller or fewer pictures cost less: --robot.width, --robot.height, --robot.cameras",
+            "smaller or fewer images cost less: --robot.width, --robot.height, --robot.cameras",
             figures,
         )
     return Finding(Level.OK, text, "", figures)
@@ -192,7 +192,7 @@ def check_disk(setup: Setup) -> Finding:
     if not os.access(folder, os.W_OK):
         return Finding(
             Level.FAIL,
-            f"{wanted} cannot be written: {folder} is somebody else's",
+            f"{wanted} cannot be written: {folder} belongs to another user",
             "choose another --dataset.root",
             figures,
         )
@@ -226,7 +226,7 @@ def check_certificate(setup: Setup) -> Finding:
         return Finding(
             Level.OK,
             f"the certificate in {folder} is valid for {days} days and all addresses of this "
-            "machine; its key is its user's alone",
+            "machine; only its user can read the key",
             "",
             {"days": days, "fingerprint": found.fingerprint},
         )
@@ -234,7 +234,7 @@ def check_certificate(setup: Setup) -> Finding:
     return Finding(
         Level.WARN if exists else Level.OK,
         f"the certificate in {folder}: {fault}; the next session makes one",
-        "headsets ask once more whether they shall trust it" if exists else "",
+        "headsets will ask again whether to trust it" if exists else "",
     )
 
 
@@ -262,9 +262,9 @@ def check_cpu(setup: Setup) -> Finding:
     }
     text = (
         f"a plan for {setup.robot}, {setup.mode}, takes {median:.1f} ms of the {period:.0f} ms "
-        f"that it has (1 in 100: {slow:.1f} ms; {cores} cores, load {load:.1f})"
+        f"available (1 in 100: {slow:.1f} ms; {cores} cores, load {load:.1f})"
     )
-    busy = " Other programs are busy on this machine: end them first." if load > cores else ""
+    busy = " Other programs are using the CPU: close them first." if load > cores else ""
     if median > period:
         return Finding(
             Level.FAIL,
@@ -278,7 +278,7 @@ def check_cpu(setup: Setup) -> Finding:
         return Finding(
             Level.WARN,
             text,
-            "cameras and video encoding need time too: smaller pictures, or a lower "
+            "cameras and video encoding need time too: smaller images, or a lower "
             f"--teleop.retargeter.control_hz.{busy}",
             kept,
         )
@@ -310,7 +310,7 @@ def _listen(host: str, port: int) -> Finding:
     except OSError as error:
         return Finding(
             Level.FAIL,
-            f"port {port} at {host} cannot be listened at: {error.strerror or error}",
+            f"port {port} at {host} cannot be opened: {error.strerror or error}",
             "end the other program (another session of ours?), or choose another port with "
             "--teleop.device.port; the address must be one of this machine's",
         )
@@ -319,7 +319,7 @@ def _listen(host: str, port: int) -> Finding:
 
 def _knock(host: str, port: int) -> Finding:
     if not host:
-        return Finding(Level.FAIL, "no address of a Vision Pro", "give it: --host ADDRESS")
+        return Finding(Level.FAIL, "no address of a Vision Pro", "pass --host ADDRESS")
     try:
         with socket.create_connection((host, port), timeout=TIMEOUT_S):
             return Finding(Level.OK, f"{host} answers at port {port}")
@@ -357,7 +357,7 @@ def check_interpreter(setup: Setup) -> Finding:
         return Finding(
             Level.FAIL,
             f"{here} lacks packages: {'; '.join(faults)}",
-            "install anew: pip install -e . in the project's folder",
+            "reinstall: pip install -e . in the project's folder",
             {"faults": faults},
         )
     return Finding(Level.OK, f"{here}, with all packages")
@@ -389,7 +389,7 @@ def check_headset(setup: Setup) -> Finding:
     """Connect, and count what comes; for a page, wait until somebody has opened it."""
     if not setup.device:
         return Finding(
-            Level.SKIP, "no headset was named", "name it: --device avp --host ADDRESS, or webxr"
+            Level.SKIP, "no headset was named", "pass --device avp --host ADDRESS, or webxr"
         )
     from xop_lerobot.operator.devices import DeviceConfig, make_device  # noqa: PLC0415
     from xop_lerobot.operator.devices.live import LiveDevice  # noqa: PLC0415
@@ -451,23 +451,23 @@ def _measure(device, seconds: float) -> Finding:  # noqa: ANN001  a LiveDevice, 
         return Finding(
             Level.FAIL,
             text,
-            "the robot would be let go again and again: come nearer to the access point, use "
-            "5 GHz or a cable, and end other programs",
+            "the robot would be disengaged repeatedly: come nearer to the access point, use "
+            "5 GHz or a cable, and close other programs",
             figures,
         )
     if status.slow_hands:
         return Finding(
             Level.FAIL,
             f"{text}. {status.trouble}",
-            "hold both hands before you, in good light, and end other apps of the headset: hands "
-            "of which so few poses come engage nothing",
+            "hold both hands in front of you, in good light, and close other apps of the headset: "
+            "hands with so few poses cannot engage",
             figures,
         )
     if rate < GOOD_HZ or (status.delay or 0) > SLOW_S or min(shares) < 0.9:
         return Finding(
             Level.WARN,
             text,
-            "hold both hands before you, in good light; a better network makes the delay shorter",
+            "hold both hands in front of you, in good light; a better network shortens the delay",
             figures,
         )
     return Finding(Level.OK, text, "", figures)
@@ -496,7 +496,7 @@ def check_plugin(setup: Setup) -> Finding:
         return Finding(
             Level.FAIL,
             f"LeRobot cannot be loaded: {answer.text}",
-            "install it anew: pip install -e .",
+            "reinstall it: pip install -e .",
         )
     known = json.loads(answer.text.splitlines()[-1])
     missing = [name for kind, names in WANTED.items() for name in names if name not in known[kind]]

@@ -67,14 +67,16 @@ def make_parser() -> CommandParser:
         "127.0.0.1)")  # fmt: skip
     add("--port", type=int, default=0, help="its port (default: avp 12345, webxr 8012)")
     add("--seconds", type=float, default=default.seconds,
-        help=f"for how long its stream is measured [s] (default: {default.seconds:g})")  # fmt: skip
+        help=f"duration of the stream measurement [s] (default: {default.seconds:g})")  # fmt: skip
     add("--wait", type=float, default=default.wait,
-        help=f"for how long it is waited for [s] (default: {default.wait:g})")  # fmt: skip
+        help=f"time to wait for it [s] (default: {default.wait:g})")  # fmt: skip
     add("--robot", default=default.robot, help="robot whose planner is timed (default: g1)")
-    add("--mode", default=default.mode, help="in which mode (default: stationary)")
+    add("--mode", default=default.mode, help="mode of the planner (default: stationary)")
     add("--root", type=Path, default=None, help="where datasets go (default: LeRobot's folder)")
     add(
-        "--only", default="", help=f"checks to run, with commas: {', '.join(CHECKS)} (default: all)"
+        "--only",
+        default="",
+        help=f"checks to run, comma-separated: {', '.join(CHECKS)} (default: all)",
     )
     add("--json", action="store_true", help="print one JSON object instead of lines")
     return parser
@@ -158,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps({"ok": not failed, "checks": checks}, indent=1))
     else:
         verdict = "not ready" if failed else "ready"
-        print(f"\n{verdict}: {failed} of {len(findings)} checks failed, {warned} with a drawback")
+        print(f"\n{verdict}: {failed} of {len(findings)} checks failed, {warned} with a warning")
     return 1 if failed else 0
 
 

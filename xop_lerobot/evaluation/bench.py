@@ -335,8 +335,8 @@ def make_parser() -> CommandParser:
         help="length of a rollout [steps of 20 ms]; 0: the preset's (default: 0)")  # fmt: skip
     add("--threads", type=int, default=0, help="threads of the physics; 0: cores (default: 0)")
     for name, text in (
-        ("steps", "solves that are timed"),
-        ("warmup", "solves before them"),
+        ("steps", "timed solves"),
+        ("warmup", "untimed solves before them"),
         ("seed", "seed of sensors and samples"),
     ):
         add(
@@ -353,7 +353,7 @@ def make_parser() -> CommandParser:
         add(f"--{name}", default=defaults[name], help=f"{text} (default: {defaults[name]})")
     add("--low-level", default="", help="low-level policy (default: the robot's own)")
     add("--low-level-path", default="", help="file of the low-level policy (default: its own)")
-    add("--json", type=Path, help="file for the figures; times in ms (default: none)")
+    add("--json", type=Path, help="file for the results; times in ms (default: none)")
     add("--profile", action="store_true", help="print where the time of a step goes")
     return parser
 

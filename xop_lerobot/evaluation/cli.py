@@ -3,8 +3,8 @@
     xop-eval --robot g1 --task dual_point_touch --methods mpc,mpc_no_sync,direct --json out.json
     xop-eval --config configs/paper_tables.yaml --report outputs/paper_tables
 
-Trials run in parallel processes, each written down as soon as it is over. The same command goes
-on where an interrupted one stopped, and adds no trial that is there already.
+Trials run in parallel processes, and each is saved when it ends. The same command resumes an
+interrupted study and repeats no finished trial.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ def make_parser() -> CommandParser:
         "--variant and --low-level then choose from it (default: none)")  # fmt: skip
     add("--robot", help="g1 or rby1")
     add("--task", help="dual_point_touch, box_pick_and_place or non_prehensile_transport")
-    add("--methods", help="methods, with commas between: mpc, mpc_no_sync, mpc_table1, direct, "
+    add("--methods", help="methods, comma-separated: mpc, mpc_no_sync, mpc_table1, direct, "
         "direct_amo (default: mpc,direct)")  # fmt: skip
     add("--variant", help="variants of the methods, with commas between; each is a binding of the "
         "robot (v1, v2), upright and a preset (conservative, aggressive) with underscores "
         "between, as v2_upright (default: the robot's own)")  # fmt: skip
-    add("--low-level", help="low-level policies, with commas between: default, falcon, "
+    add("--low-level", help="low-level policies, comma-separated: default, falcon, "
         "diff_drive (default: the robot's own)")  # fmt: skip
     add("--low-level-path", help="files of low-level policies, as falcon=FILE,amo=FOLDER "
         "(default: their own)")  # fmt: skip
@@ -57,18 +57,20 @@ def make_parser() -> CommandParser:
         "points=0.3:0.5 [m] (default: the task's own)")  # fmt: skip
     add("--fps", type=int, help="rate of the control loop, divides 50 [Hz] (default: 25)")
     add("--time-limit", type=float,
-        help="time after which an episode is cut off [s] (default: the task's own)")  # fmt: skip
+        help="time limit of an episode [s] (default: the task's own)")  # fmt: skip
     add("--workers", type=int, default=0, help="parallel processes; 0: cores (default: 0)")
     add("--out", type=Path, default=Path("outputs/eval"),
-        help="folder of the results, by which a study goes on (default: outputs/eval)")  # fmt: skip
-    add("--fresh", action="store_true", help="run every trial again, also those that are there")
-    add("--no-run", action="store_true", help="run nothing, only make tables of what is there")
+        help="folder of the results; a study resumes from it (default: outputs/eval)")  # fmt: skip
+    add("--fresh", action="store_true", help="run every trial again, also finished ones")
+    add("--no-run", action="store_true", help="run nothing, only make tables of finished trials")
     add("--json", type=Path, help="file for the table as a list of objects (default: none)")
     add("--csv", type=Path, help="file for the table (default: none)")
     add(
-        "--report", type=Path, help="folder for a page with tables, plots and films (default: none)"
+        "--report",
+        type=Path,
+        help="folder for a page with tables, plots and videos (default: none)",
     )
-    add("--videos", type=int, default=1, help="films of each cell in the report (default: 1)")
+    add("--videos", type=int, default=1, help="videos of each cell in the report (default: 1)")
     return parser
 
 
@@ -157,7 +159,7 @@ def _choose(
         if all(v is None or getattr(cell.setup, name) in v for name, v in wanted.items())
     ]
     if not chosen:
-        raise BadValue("the study has no cell that fits all of the given names")
+        raise BadValue("no cell of the study matches all given names")
     return chosen
 
 
@@ -178,7 +180,8 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             interrupted = True
             print(
-                f"interrupted; what is finished is in '{args.out}', and the same command goes on",
+                f"interrupted; finished trials are in '{args.out}'. Run the same command again to "
+                "resume",
                 file=sys.stderr,
             )
     records = results.load()

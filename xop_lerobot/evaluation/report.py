@@ -313,7 +313,11 @@ def _make_plots(
     for kind, title, picture in (
         ("rates", "Rates, with 95% intervals", plot_rates(groups)),
         ("means", "Every trial, mean and its 95% interval", plot_means(groups)),
-        ("ways", "Way of the head from above; a cross ends a failure", plot_ways(groups)),
+        (
+            "ways",
+            "Path of the head from above; a cross marks the end of a failure",
+            plot_ways(groups),
+        ),
         ("errors", "Errors over time, first trial of each", plot_errors(groups)),
     ):
         if picture is not None:
@@ -344,9 +348,9 @@ def _make_films(
             try:
                 write_film(path, record, cell.setup, load_film(results.film_path(key)))
             except RenderingUnavailable as error:
-                return [f'<p class="note">No films: {escape(error)}</p>']
+                return [f'<p class="note">No videos: {escape(error)}</p>']
             except XopError as error:
-                logger.warning("no film of %s: %s", key, error)
+                logger.warning("no video of %s: %s", key, error)
                 continue
             end = "success" if record["success"] else record["failure"] or "time is up"
             text = escape(f"{label_cell(cell, cells)}, seed {record['seed']}: {end}")

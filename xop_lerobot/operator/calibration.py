@@ -86,8 +86,8 @@ def load_calibration(path: Path) -> Calibration:
         return Calibration(**values)
     except (ValueError, BadValue) as error:
         raise BadValue(
-            f"calibration '{path}' cannot be used: {error}. Calibrate anew with lerobot-calibrate, "
-            "or delete it"
+            f"calibration '{path}' cannot be used: {error}. Calibrate again with "
+            "lerobot-calibrate, or delete it"
         ) from None
 
 
@@ -145,7 +145,7 @@ class Guide:
             self.progress = 0.0
             self.hint = (
                 f"Your head is {height:.2f} m over the headset's floor: set the floor in the "
-                "headset, or start its app anew, standing."
+                "headset, or restart its app, standing."
             )
             return
         measured = self._watch(frame.time, frame.head[:3], STAND_S)
@@ -191,7 +191,7 @@ def _find_fault(frame: OperatorFrame, arms: np.ndarray) -> str:
     if not all(SHOULDERS[0] <= -z <= SHOULDERS[1] for z in arms[:, 2]):
         return "Hold your hands level with your shoulders."
     if reach > ARM_REACH[1]:
-        return f"Your hands seem to be {reach:.2f} m away, which nobody's are."
+        return f"Your hands seem to be {reach:.2f} m away, farther than anybody's."
     return ""
 
 

@@ -166,7 +166,7 @@ class Clutch:
 
 logger = logging.getLogger(__name__)
 
-UNSEEN = "the headset no longer sees where the head is, or is silent"
+UNSEEN = "the headset has lost its position, or sends nothing"
 """Why the operator has let go, where the device knows no better."""
 
 

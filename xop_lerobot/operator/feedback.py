@@ -73,7 +73,7 @@ def list_warnings(
     status = device.status if isinstance(device, LiveDevice) else None
     if frame is not None and not frame.tracked[0]:
         if not device.trouble:
-            warnings.append("The headset does not see where it is, or sends nothing.")
+            warnings.append("The headset has lost its position, or sends nothing.")
     elif frame is not None:
         slow = () if status is None else status.slow_hands  # the device tells of these
         tracked = zip(HANDS, frame.tracked[1:], strict=True)
@@ -85,7 +85,7 @@ def list_warnings(
         rate = math.inf if status is None else status.rate
         if rate < SLOW_HZ:
             warnings.append(
-                f"Only {rate:.0f} poses arrive in a second: gestures need {SLOW_HZ:.0f}."
+                f"Only {rate:.0f} poses per second arrive: gestures need {SLOW_HZ:.0f}."
             )
     if plan_age is not None and plan_age > LATE_S:
         warnings.append(

@@ -342,7 +342,7 @@ def explain_gestures(config: GestureConfig) -> dict[str, str]:
     other = "right" if first == "left" else "left"
     explained = {
         "engage": f"{palms}pinch with both hands, and hold still for {clutch.hold:g} s".capitalize()
-        + "; the same lets go",
+        + "; the same gesture disengages",
         "mode": f"Pinch twice with the {first} hand",
     }
     for name, length in (

@@ -153,7 +153,7 @@ def make_recording(arrays: Mapping[str, np.ndarray], source: object) -> Recordin
         i = int(np.argmax(steps))
         raise BadRecording(
             source,
-            f"t must be in seconds, from a clock that nobody sets: its steps may be up to "
+            f"t must be in seconds, from a monotonic clock: its steps may be up to "
             f"{LONGEST_STEP_S:g} s long, but t[{i}] = {t[i]:.10g} s is followed by "
             f"t[{i + 1}] = {t[i + 1]:.10g} s",
         )

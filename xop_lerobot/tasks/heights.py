@@ -11,7 +11,7 @@ from xop_lerobot.core.errors import BadValue, UnknownName
 type HeightRange = tuple[float, float]
 """Lowest and highest height over the floor [m]."""
 
-_FORM = "NAME=HEIGHT or NAME=LOW:HIGH [m], with commas between"
+_FORM = "NAME=HEIGHT or NAME=LOW:HIGH [m], comma-separated"
 
 
 def parse_heights(text: str) -> dict[str, HeightRange]:

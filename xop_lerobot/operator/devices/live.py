@@ -246,7 +246,7 @@ class LiveDevice(Device):
 
     def end_silence(self) -> None:
         """Do something about a connection over which nothing comes: make it anew."""
-        self._say(f"{self.address}: nothing has come for {SILENT_S:g} s. Connecting anew.")
+        self._say(f"{self.address}: nothing has come for {SILENT_S:g} s. Reconnecting.")
         self.interrupt()
 
     def leave(self, reason: str) -> None:
@@ -289,7 +289,6 @@ def _describe_slow_hands(status: StreamStatus) -> str:
     rate = min(rate for rate in status.hand_rates if rate is not None)
     hands = f"{slow[0]} hand" if len(slow) == 1 else "hands"
     return (
-        f"The headset tells where your {hands} {'is' if len(slow) == 1 else 'are'} only "
-        f"{rate:.0f} times a second; they are followed from {math.ceil(HAND_HZ)} on. Hold them in "
-        "view, in good light, and end other apps."
+        f"The headset updates your {hands} only {rate:.0f} times a second; at least "
+        f"{math.ceil(HAND_HZ)} are needed. Hold them in view, in good light, and close other apps."
     )

@@ -236,5 +236,5 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as fault:
         raise PortTaken(
             f"cannot listen at {host} port {port}: {fault.strerror or fault}. Choose another "
-            "--teleop.device.port, or end the session that has it"
+            "--teleop.device.port, or end the session that uses it"
         ) from fault

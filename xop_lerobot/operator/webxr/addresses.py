@@ -112,7 +112,7 @@ def write_invitation(
         text += draw_qr(urls[0])
     if tls:
         text += (
-            "The browser warns once, as this machine has made its certificate itself. It is the\n"
+            "The browser warns once, since the certificate is self-signed. It is the\n"
             f"right one if its SHA-256 fingerprint is\n{MARGIN}{fingerprint}\n"
         )
     if local:

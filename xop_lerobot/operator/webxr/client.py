@@ -163,7 +163,7 @@ class Client:
             except ConnectionError:
                 return
             except Exception:
-                logger.exception("what is shown cannot be sent; the page will connect anew")
+                logger.exception("what is shown cannot be sent; the page will reconnect")
                 self.abort()
                 return
             await asyncio.sleep(SEND_S)

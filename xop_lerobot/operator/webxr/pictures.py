@@ -74,7 +74,7 @@ class PictureEncoder:
             try:
                 self.newest = encode(given or {})
             except (OSError, ValueError, TypeError):
-                logger.exception("a camera's picture cannot be encoded")
+                logger.exception("a camera's image cannot be encoded")
 
 
 def encode(pictures: Mapping[str, np.ndarray]) -> Picture:

@@ -225,9 +225,7 @@ class HeadsetServer:
         if client.role == "monitor":
             monitors = sum(other.role == "monitor" for other in self._clients)
             return (
-                f"too many monitors; {MAX_MONITORS} may look on"
-                if monitors >= MAX_MONITORS
-                else None
+                f"too many monitors; {MAX_MONITORS} may watch" if monitors >= MAX_MONITORS else None
             )
         if client.role != "operator":
             return "role must be operator or monitor"
@@ -246,11 +244,11 @@ class HeadsetServer:
         """Take what `client` sends until it leaves or does what it may not."""
         async for message in client.ws:
             if message.type is not WSMsgType.TEXT:
-                reason: str | None = "only text is taken here"
+                reason: str | None = "only text messages are accepted"
             else:
                 reason = self._take(client, message.data)
             if reason is not None:
-                self._forget(client, f"the page was shut out: {reason}")
+                self._forget(client, f"the page was disconnected: {reason}")
                 await self._dismiss(client, reason)
                 return
 

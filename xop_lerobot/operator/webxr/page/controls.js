@@ -4,7 +4,7 @@ const METRES_PER_PIXEL = 0.0013;
 const METRES_PER_NOTCH = 0.0006; // of the wheel, whose notch has about 100
 const GROUPS = [
   ['Robot', [
-    ['Space', 'Space', 'engage, let go', 'engage'],
+    ['Space', 'Space', 'engage, disengage', 'engage'],
     ['KeyM', 'M', 'double pinch left', '!tapLeft'],
     ['KeyK', 'K', 'double pinch right', '!tapRight'],
     ['KeyN', 'N', 'double pinch both', '!tapBoth'],
@@ -87,7 +87,7 @@ export class Controls {
         return [this.#makeCap(label, meaning, action), meaning];
       },
     )));
-    const mouse = makeGroup('Mouse, on the picture', MOUSE.map(([how, what]) => [
+    const mouse = makeGroup('Mouse, on the image', MOUSE.map(([how, what]) => [
       Object.assign(document.createElement('kbd'), { textContent: how }), what,
     ]), 'mouse');
     caps.replaceChildren(...groups.slice(0, 2), mouse, ...groups.slice(2));

@@ -129,7 +129,7 @@ function findTroubles(session, data, hasFloor) {
     troubles.push('A menu of the headset is open: close it to go on.');
   }
   if (!hasFloor) troubles.push('The headset knows no floor: set it up, then start again.');
-  if (!data.head) troubles.push('The headset does not know where it is: look about.');
+  if (!data.head) troubles.push('The headset has lost its position: look around.');
   if (!data.left && !data.right) troubles.push('No hand is seen: hold both hands in view.');
   else if (!data.left) troubles.push('The left hand is not seen.');
   else if (!data.right) troubles.push('The right hand is not seen.');

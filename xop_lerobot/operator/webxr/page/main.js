@@ -72,7 +72,7 @@ class App {
       if (document.hidden) {
         this.controls.releaseAll();
         this.link.send({ type: 'bye', reason: 'the page of the stand-in is hidden' });
-        this.#tell('This page was hidden, and the robot was let go. Engage again.');
+        this.#tell('This page was hidden, and the robot was disengaged. Engage again.');
       }
     });
   }
