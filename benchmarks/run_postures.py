@@ -109,7 +109,9 @@ def main(arguments: list[str] | None = None) -> int:
         assert isinstance(retargeter, MpcRetargeter)
 
         def measure() -> dict[str, np.ndarray]:
-            return retargeter.problem.readings.compute_poses(loop.state.true_qpos, morphology.frames)
+            return retargeter.problem.readings.compute_poses(
+                loop.state.true_qpos, morphology.frames
+            )
 
         frames = measure()
         head = frames.pop("head")

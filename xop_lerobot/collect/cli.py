@@ -1,4 +1,4 @@
-r"""`xop-collect`: tasks as LeRobot datasets, with success labels and without anybody there.
+r"""`xop-collect`: unattended collection of LeRobot datasets with success labels.
 
     xop-collect --robot g1 --task box_pick_and_place --episodes 50 --seed 0 \
         --root outputs/boxes --repo-id me/boxes
@@ -28,7 +28,7 @@ from xop_lerobot.core.shutdown import stop_on_sigterm
 
 @dataclass(frozen=True)
 class CollectResult:
-    """What there is in the end.
+    """Outcome of a collection.
 
     Attributes:
         episodes: Episodes that were run, of this and of all runs before.
@@ -55,7 +55,7 @@ def collect(
     workers: int = 0,
     ray: str = "",
 ) -> CollectResult:
-    """Collect a dataset, or what is missing of it.
+    """Collect a dataset, or its missing episodes.
 
     Args:
         config: What is collected.

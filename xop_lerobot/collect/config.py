@@ -1,4 +1,4 @@
-"""What `xop-collect` collects: a task, a robot, a simulated operator and their settings."""
+"""Configuration of `xop-collect`: task, robot, simulated operator and their settings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """What decides the content of a collected dataset; equal ones give equal episodes.
+    """Everything that determines a dataset's content; equal configurations give equal episodes.
 
     Attributes:
         robot: Name of the robot's morphology, `g1` or `rby1`.
@@ -93,7 +93,7 @@ class CollectConfig:
         return {**settings, "cameras": list(self.cameras)}
 
     def describe(self, attempt: Attempt) -> str:
-        """Say in a few words what came of an episode."""
+        """Describe the outcome of an episode in a few words."""
         return "success" if attempt.success else attempt.failure or "no success"
 
     @property
@@ -167,7 +167,7 @@ class CollectConfig:
 
 
 def import_plugins(names: tuple[str, ...]) -> None:
-    """Import modules of the user's own.
+    """Import the user's own modules.
 
     Raises:
         BadValue: If one cannot be found.
@@ -187,7 +187,7 @@ def import_plugins(names: tuple[str, ...]) -> None:
 def add_config(
     parser: CommandParser, kind: type[CollectConfig] = CollectConfig, **texts: str
 ) -> None:
-    """Add the flags that decide what each episode is simulated with, but for robot and task.
+    """Add the flags that configure the simulation of an episode, except robot and task.
 
     Args:
         parser: Parser of the command.
@@ -223,7 +223,7 @@ def add_config(
 
 
 def add_crew(parser: CommandParser) -> None:
-    """Add `--workers` and `--ray`, which say who makes the episodes."""
+    """Add `--workers` and `--ray`."""
     parser.add_argument(
         "--workers", type=int, default=0, help="processes; 0: one per core (default: 0)"
     )
@@ -237,13 +237,13 @@ def add_crew(parser: CommandParser) -> None:
 
 
 def split(text: str) -> tuple[str, ...]:
-    """Read names with commas between."""
+    """Read comma-separated names."""
     names = find_text(text.strip("[] ")).split(",")
     return tuple(name.strip() for name in names if name.strip())
 
 
 def read_config[C: CollectConfig](kind: type[C], arguments: argparse.Namespace, **more: Any) -> C:
-    """Make a configuration of all flags that are named as its fields.
+    """Make a configuration from the flags named as its fields.
 
     Args:
         kind: Its class.

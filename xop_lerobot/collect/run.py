@@ -1,4 +1,4 @@
-"""Make the episodes of a dataset that are missing, and put all together.
+"""Make the missing episodes of a dataset, and merge all of them.
 
 Episodes are made in parallel, by processes of this machine or of a Ray cluster. A worker
 of this machine writes into the collection's folder itself. Those of a cluster need no
@@ -41,7 +41,7 @@ _HEAVY = ("xop_lerobot.collect.worker", "mujoco", "onnxruntime")
 
 
 class WorkerFailed(XopError):
-    """A worker could not make an episode; the message says which and why."""
+    """A worker failed to make an episode; the message names it and the reason."""
 
 
 def make_attempts(
@@ -95,7 +95,7 @@ def get_index(job: Any) -> int:
 
 @dataclasses.dataclass
 class _Job:
-    """Makes episodes in a worker; the robot lives on from one to the next."""
+    """Makes episodes in a worker and reuses the robot between them."""
 
     config: CollectConfig
     run: float
@@ -135,7 +135,7 @@ class _Ship(_Job):
 
 
 def _unpack(folder: CollectFolder, attempt: Attempt, packed: bytes) -> Attempt:
-    """Write an episode that came from another machine, and let it count."""
+    """Write an episode received from another machine, and mark it as finished."""
     attempt = dataclasses.replace(attempt, elapsed=time.time() - attempt.run)
     draft = folder.open_attempt(attempt.index)
     with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
@@ -146,7 +146,7 @@ def _unpack(folder: CollectFolder, attempt: Attempt, packed: bytes) -> Attempt:
 
 @dataclass(frozen=True)
 class Collection:
-    """What there is in the end.
+    """Outcome of a collection.
 
     Attributes:
         attempts: Episodes of the dataset and all that were asked for.
@@ -168,7 +168,7 @@ def run_collection(
     quiet: bool = False,
     make_jobs: Callable[[Sequence[int]], Iterable[Any]] = iter,
 ) -> Collection:
-    """Make the episodes that are not there yet, and merge all into one dataset.
+    """Make the missing episodes, and merge all into one dataset.
 
     Args:
         config: What is collected.
@@ -219,7 +219,7 @@ def run_collection(
 
 
 def _compute_walls(folder: CollectFolder, attempts: dict[int, Attempt]) -> dict[str, float]:
-    """Compute how long each run took [s], by its start; a killed one until its last episode."""
+    """Duration of each run [s], by its start; of a killed run until its last episode."""
     walls: dict[str, float] = dict(folder.read_dataset().get("walls", {}))
     for attempt in attempts.values():
         run = str(attempt.run)
@@ -228,7 +228,7 @@ def _compute_walls(folder: CollectFolder, attempts: dict[int, Attempt]) -> dict[
 
 
 class _Progress:
-    """Says on standard error how far it is: a line an episode, and a bar where it is a terminal.
+    """Reports progress on standard error: a line per episode, and a bar on a terminal.
 
     Args:
         config: What is collected.
@@ -250,7 +250,7 @@ class _Progress:
         self._bar.close()
 
     def say(self, text: str) -> None:
-        """Say something, above the bar."""
+        """Print a line above the bar."""
         if self._quiet:
             return
         if self._bar.disable:
@@ -259,7 +259,7 @@ class _Progress:
             self._bar.write(text, file=sys.stderr)
 
     def note(self, attempt: Attempt) -> None:
-        """Say what came of one episode."""
+        """Print the outcome of one episode."""
         self._made += 1
         self._frames += attempt.frames
         self._successes += attempt.success

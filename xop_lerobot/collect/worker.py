@@ -114,7 +114,7 @@ class Collector:
         )
 
     def _run(self, job: Any, teleop: Xop, dataset: XopDataset) -> int:
-        """Run the episode until its task, its operator or its time is over; return its frames."""
+        """Run the episode until task, operator or time limit ends it; return its frames."""
         self.session.begin_episode(get_index(job))
         events = {"exit_early": False}
         dataset.begin(events, self.get_limit(job))
@@ -130,15 +130,15 @@ class Collector:
     # What depends on the kind of collection.
 
     def begin(self, job: Any, teleop: Xop, dataset: XopDataset) -> None:
-        """Do what must be done before the first frame of an episode."""
+        """Prepare the first frame of an episode."""
 
     def get_limit(self, job: Any) -> int:
-        """Frames after which an episode is ended in any case."""
+        """Largest number of frames of an episode."""
         del job
         return count_ticks(self._task.time_limit + _GRACE_S, self.config.fps)
 
     def get_instruction(self, job: Any, frame: int) -> str:
-        """The task in words, at a frame of an episode."""
+        """Instruction of the task at a frame of an episode."""
         del job, frame
         return self._task.instruction
 
@@ -147,11 +147,11 @@ class Collector:
         return self.config.make_task()
 
     def close(self) -> None:
-        """Let go of the robot; may be called twice."""
+        """Release the robot; may be called twice."""
         self.robot.disconnect()
 
 
 def _calm_down() -> None:
-    """Leave out what encoders and decoders tell of themselves."""
+    """Silence the log output of encoders and decoders."""
     av.logging.set_libav_level(av.logging.ERROR)
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

@@ -1,1 +1,1 @@
-"""Changes from outside the process: a local socket, its client, and keys of the terminal."""
+"""Changes of settings from outside: a local socket, its client, and keys of the terminal."""

@@ -26,11 +26,11 @@ _SWITCH = {"on": True, "true": True, "yes": True, "off": False, "false": False, 
 
 
 class NoSession(XopError):
-    """Nobody listens at the control socket."""
+    """No session listens at the control socket."""
 
 
 class Refused(XopError):
-    """The session has refused a request; the message says why, and nothing has changed."""
+    """The session refused a request; the message gives the reason, and nothing has changed."""
 
 
 class ControlClient:
@@ -90,7 +90,7 @@ class ControlClient:
 
 
 def build_request(flags: argparse.Namespace) -> dict[str, Any]:
-    """Build the request that the flags ask for.
+    """Build the request from the flags.
 
     Raises:
         BadValue: If a pair is none, or a value neither a number nor a switch where it must be.
@@ -168,10 +168,10 @@ HELP = "d/c/a/t: preset default, conservative, aggressive, table1; u: upright; m
 
 
 class Target(Protocol):
-    """What the keys change: a `Teleoperation`."""
+    """Interface that the keys act on, such as `Teleoperation`."""
 
     def change(self, change: dict[str, Any], source: str = "call") -> dict[str, Any]:
-        """Ask for other settings."""
+        """Request a change of settings."""
         ...
 
     def toggle(self, name: str, source: str = "call") -> dict[str, Any]:
@@ -180,7 +180,7 @@ class Target(Protocol):
 
 
 def press(key: str, target: Target) -> bool:
-    """Do what `key` stands for; return whether it stands for anything. Refusals are logged."""
+    """Execute the action of `key`; return whether it has one. Refusals are logged."""
     key = key.lower()
     try:
         if key in PRESET_KEYS:

@@ -1,4 +1,4 @@
-"""What goes over the control socket: one JSON object a line, and one line for an answer.
+"""Protocol of the control socket: one JSON object per line, and one line as answer.
 
 A request is a change in the form of `parse_change`, `{"toggle": name}`, or `{"get": "settings"}`.
 The answer is `{"ok": true, "settings": {...}}`, the settings that hold from the next tick on, or
@@ -24,15 +24,15 @@ _MAX_PATH = 100  # the kernel takes 107 bytes on Linux and 103 on macOS
 
 
 class Changeable(Protocol):
-    """What requests are for: a `Teleoperation`."""
+    """Interface that requests act on, such as `Teleoperation`."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What is in force."""
+        """The present settings."""
         ...
 
     def change(self, change: Mapping[str, Any], source: str = "call") -> dict[str, Any]:
-        """Ask for other settings."""
+        """Request a change of settings."""
         ...
 
     def toggle(self, name: str, source: str = "call") -> dict[str, Any]:
@@ -41,11 +41,11 @@ class Changeable(Protocol):
 
 
 class NotJson(XopError):
-    """A line is no JSON object, so whoever sends it does not speak this protocol."""
+    """A line is not a JSON object; the client does not speak this protocol."""
 
 
 def find_socket(control: str, session: str) -> Path | None:
-    """Find where the control socket is.
+    """Find the path of the control socket.
 
     Args:
         control: Empty, `false`, `off`, `no` or `none` for none; `true`, `on` or `yes` for the
@@ -82,7 +82,7 @@ def find_runtime_dir() -> Path:
 
 
 def answer(line: bytes, target: Changeable) -> dict[str, Any]:
-    """Do what a request asks for, and return the answer.
+    """Execute a request, and return the answer.
 
     Raises:
         NotJson: If `line` is no JSON object.

@@ -1,4 +1,4 @@
-"""The control socket: takes changes from other programs of the same user while a robot runs."""
+"""Control socket: other programs of the same user change settings while a robot runs."""
 
 from __future__ import annotations
 

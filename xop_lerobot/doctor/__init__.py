@@ -1,1 +1,1 @@
-"""`xop-doctor`: whether this machine is ready, and what to do where it is not."""
+"""`xop-doctor`: checks whether this machine is ready, and advises."""

@@ -1,4 +1,4 @@
-"""The checks of `xop-doctor`: each says how something is, and what to do where it is not well.
+"""Checks of `xop-doctor`: each returns a finding with advice.
 
 What may crash or hang (a driver, a plugin) runs in a Python of its own.
 """
@@ -30,7 +30,7 @@ from xop_lerobot.plant.rendering import choose_backends
 
 
 class Answer(NamedTuple):
-    """What became of it."""
+    """Result of a child process."""
 
     ok: bool
     """Whether it has ended well."""
@@ -63,7 +63,7 @@ def run_child(code: str, *arguments: str, timeout: float = 120.0) -> Answer:
 
 
 class Level(Enum):
-    """How well it is."""
+    """Severity of a finding."""
 
     OK = "ok"
     WARN = "warn"
@@ -71,12 +71,12 @@ class Level(Enum):
     FAIL = "fail"
     """It does not work."""
     SKIP = "skip"
-    """It was not asked for, or cannot be known."""
+    """Not requested, or not decidable."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check has found.
+    """Result of a check.
 
     Attributes:
         level: How well it is.
@@ -93,7 +93,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Setup:
-    """What somebody wants to do with this machine.
+    """Intended use of this machine.
 
     Attributes:
         device: The headset, `avp` or `webxr`; empty for none.
@@ -153,7 +153,7 @@ print(f"{took * 1e3:.1f}|{name}")
 
 
 def check_gl(setup: Setup) -> Finding:
-    """Render a ball in a Python of its own: a bad driver ends that, and not us."""
+    """Render a ball in a separate process, which a faulty driver may crash."""
     del setup
     answer = run_child(_CODE)
     tried = ", ".join(choose_backends()) or "none"
@@ -182,7 +182,7 @@ ENOUGH_GB, LEAST_GB = 10.0, 1.0
 
 
 def check_disk(setup: Setup) -> Finding:
-    """Look at the disk of the folder, or of its nearest parent that exists."""
+    """Check the disk of the folder, or of its nearest existing parent."""
     wanted = setup.root.expanduser().absolute()
     folder = wanted
     while not folder.exists():
@@ -208,7 +208,7 @@ def check_disk(setup: Setup) -> Finding:
 
 
 def check_certificate(setup: Setup) -> Finding:
-    """Look at the certificate; nothing is made or changed."""
+    """Check the certificate without changing it."""
     if setup.device == "avp":
         return Finding(Level.SKIP, "a Vision Pro with Tracking Streamer needs none")
     if setup.host in ("", "127.0.0.1", "localhost", "::1"):
@@ -244,7 +244,7 @@ SHARE = 0.8
 
 
 def check_cpu(setup: Setup) -> Finding:
-    """Time the planner of the robot, and compare with how often it is to plan."""
+    """Time the planner of the robot, and compare with its period."""
     from xop_lerobot.core.command import Mode  # noqa: PLC0415
     from xop_lerobot.evaluation.bench import BenchConfig, run_bench  # noqa: PLC0415  MuJoCo
 
@@ -289,7 +289,7 @@ TIMEOUT_S = 3.0
 
 
 def check_ports(setup: Setup) -> Finding:
-    """Listen at the port of the page, or knock at that of a Vision Pro."""
+    """Listen on the page's port, or connect to that of a Vision Pro."""
     # Where the protocols are not installed, this check fails alone.
     from xop_lerobot.operator.devices import avp as avp_protocol  # noqa: PLC0415
     from xop_lerobot.operator.webxr import protocol as webxr_protocol  # noqa: PLC0415
@@ -364,7 +364,7 @@ def check_interpreter(setup: Setup) -> Finding:
 
 
 def find_faults(requirements: list[str]) -> list[str]:
-    """List the requirements that this Python does not fulfil; extras are left out."""
+    """List unfulfilled requirements of this Python, without extras."""
     faults = []
     for each in requirements:
         requirement = Requirement(each)
@@ -386,7 +386,7 @@ SLOW_S = 0.1
 
 
 def check_headset(setup: Setup) -> Finding:
-    """Connect, and count what comes; for a page, wait until somebody has opened it."""
+    """Connect, and measure the stream; for a page, wait until it is opened."""
     if not setup.device:
         return Finding(
             Level.SKIP, "no headset was named", "pass --device avp --host ADDRESS, or webxr"
@@ -489,7 +489,7 @@ print(json.dumps({"robots": sorted(RobotConfig.get_known_choices()),
 
 
 def check_plugin(setup: Setup) -> Finding:
-    """Ask LeRobot for its types, as its commands do, in a Python of its own."""
+    """List LeRobot's types as its commands do, in a separate process."""
     del setup
     answer = run_child(_PLUGIN_CODE, timeout=300.0)
     if not answer.ok:

@@ -1,4 +1,4 @@
-"""`xop-doctor`: checks whether this machine is ready, and says what to do where it is not.
+"""`xop-doctor`: checks whether this machine is ready, and says what to fix.
 
     xop-doctor                                        the machine alone
     xop-doctor --device avp --host 192.168.1.40       and a Vision Pro, as it streams now
@@ -48,7 +48,7 @@ DEVICES = ("avp", "webxr")
 
 
 def run_checks(setup: Setup, names: Sequence[str] = tuple(CHECKS)) -> Iterator[tuple[str, Finding]]:
-    """Run the checks `names` one after another; one that breaks down is a failure too."""
+    """Run the checks `names` one after another; a crash counts as a failure."""
     for name in names:
         try:
             yield name, CHECKS[name](setup)
@@ -123,7 +123,7 @@ def find_root() -> Path:
 
 
 def print_finding(name: str, finding: Finding) -> None:
-    """Print what was found, and what to do."""
+    """Print a finding and its advice."""
     print(f"{finding.level.value.upper():<5} {name:<12} {finding.text}", flush=True)
     if finding.advice:
         print(f"{'':18} → {finding.advice}", flush=True)

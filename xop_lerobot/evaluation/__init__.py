@@ -1,1 +1,1 @@
-"""How well an episode went: figures, tables and pictures."""
+"""Evaluation of episodes: metrics, tables and images."""

@@ -1,4 +1,4 @@
-"""`xop-bench`: how long one step of the model predictive controller takes, and on what.
+"""`xop-bench`: time of one step of the model predictive controller, and its parts.
 
     xop-bench --robot g1 --mode mobile --samples 30 --horizon 3 --threads 2 --json bench.json
     xop-bench --robot rby1 --mode stationary --profile
@@ -71,7 +71,7 @@ WAIST = np.array([-0.05, 0.0, -0.42])
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """What is timed.
+    """Configuration of a benchmark.
 
     Attributes:
         robot: Name of the robot.
@@ -110,7 +110,7 @@ class BenchConfig:
 
 
 class BareRollout:
-    """The lower bound: one call of `mujoco.rollout` for all physics steps of a solve.
+    """Lower bound: one call of `mujoco.rollout` for all physics steps of a solve.
 
     It listens to the policy of a `PolicyRollout` for the controls.
 
@@ -135,7 +135,7 @@ class BareRollout:
         vars(rollout.policy)["act"] = listen
 
     def forget(self) -> None:
-        """Listen anew, before a solve."""
+        """Discard the record of the last solve."""
         self._targets.clear()
 
     def run(self, state: RobotState, num_samples: int, horizon: int) -> float:
@@ -231,7 +231,7 @@ def _time_solves(
     sync: StateSync,
     bare: BareRollout,
 ) -> list[dict[str, float]]:
-    """Solve, roll out bare, and let the robot go on, over and over; times in seconds."""
+    """Repeat solve, bare rollout and robot step; times in seconds."""
     mode, used = config.mode, retargeter.configs[config.mode]
     period = max(1, round(1 / used.control_hz / POLICY_DT)) * POLICY_DT
     site = retargeter.morphology.frames["head"]
@@ -269,7 +269,7 @@ def move_from(home: np.ndarray, offset: tuple[float, float, float], yaw: float =
 
 
 def bend_from(home: np.ndarray, pitch: float = 0, yaw: float = 0) -> np.ndarray:
-    """Pose of a head whose owner turns by `pitch` and `yaw` [rad] about the waist. Shape (7,)."""
+    """Head pose after bending by `pitch` and turning by `yaw` [rad] at the waist. Shape (7,)."""
     heading = quat_from_yaw(compute_heading(home[3:]))
     back = quat_from_yaw(-compute_heading(home[3:]))
     turn = quat_multiply(quat_multiply(heading, quat_from_rpy(0, pitch, yaw)), back)
@@ -307,14 +307,14 @@ def make_curve(home: np.ndarray) -> Callable[[float], np.ndarray]:
 
 
 def _sway(home: np.ndarray, time: float) -> np.ndarray:
-    """A standing person who bends, turns and squats all the while. Shape (7,)."""
+    """Head pose of a standing person who keeps bending, turning and squatting. Shape (7,)."""
     pose = bend_from(home, pitch=0.15 * np.sin(1.1 * time), yaw=0.4 * np.sin(0.7 * time))
     down = 0.06 * (1 - np.cos(0.9 * time))
     return make_pose(pose[:3] - np.array([0, 0, down]), pose[3:])
 
 
 def print_profile(figures: Mapping[str, Any]) -> None:
-    """Print where the time of a step goes."""
+    """Print the time of each part of a step."""
     whole = figures["step_ms_median"]
     print(f"\n{'part':<18} {'ms':>8} {'share':>7}")
     for name, value in figures["profile"].items():

@@ -1,4 +1,4 @@
-"""Figures of `xop-bench` from timed solves, the machine they were made on, and their tables."""
+"""Results of `xop-bench`: metrics of timed solves, the machine, and Markdown tables."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KEYS = (
 
 
 def summarise(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Figures of timed solves.
+    """Metrics of timed solves.
 
     Args:
         rows: Times by part of every solve [s]; ``step`` is the whole, ``bare`` the bare rollout,
@@ -55,7 +55,7 @@ def summarise(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
 
 
 def make_profile(medians: Mapping[str, float]) -> dict[str, float]:
-    """Split the step into parts that add up to it, but for medians not adding up exactly.
+    """Split the step into parts; their medians add up to the step's only approximately.
 
     Args:
         medians: Median time of every part [ms].
@@ -74,7 +74,7 @@ def make_profile(medians: Mapping[str, float]) -> dict[str, float]:
 
 
 def describe_machine() -> dict[str, str]:
-    """Processor, cores and versions: what figures travel with."""
+    """Processor, cores and versions, stored beside the results."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -104,7 +104,7 @@ def make_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def make_bench_blocks(benches: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Blocks of docs/results/benchmarks.md: the machine, the figures, and where the time goes.
+    """Blocks of docs/results/benchmarks.md: the machine, the results, and the profile.
 
     Args:
         benches: Contents of JSON files of xop-bench, a row each.

@@ -97,7 +97,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def make_study(args: argparse.Namespace) -> list[Any]:
-    """Make the cells that the arguments ask for.
+    """Make the cells that the arguments name.
 
     Raises:
         UnknownName: If a name is unknown, listing the known ones.
@@ -140,7 +140,7 @@ def _parse_paths(text: str) -> dict[str, str]:
 def _choose(
     cells: list[Any], args: argparse.Namespace, lists: Mapping[str, list[str] | None]
 ) -> list[Any]:
-    """Take from a whole study what robot, task, methods, variants and policies name."""
+    """Select the cells of a study by robot, task, methods, variants and policies."""
     wanted = {
         "robot": None if args.robot is None else [args.robot],
         "task": None if args.task is None else [args.task],
@@ -164,7 +164,7 @@ def _choose(
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run what is asked for; returns the exit code."""
+    """Run the study; returns the exit code."""
     from xop_lerobot.evaluation.study import Results, collect, plan_jobs, summarise  # noqa: PLC0415
 
     cells = make_study(args)
@@ -235,7 +235,7 @@ def describe(setup: Any) -> str:
 
 
 def describe_outcome(record: Mapping[str, Any]) -> str:
-    """How a trial ended, in a line."""
+    """Outcome of a trial in one line."""
     if record["success"]:
         text = f"success after {record['completion_s']:.1f} s"
     else:
@@ -246,7 +246,7 @@ def describe_outcome(record: Mapping[str, Any]) -> str:
 
 
 def _warn_of_mixture(found: Sequence[Sequence[Mapping[str, Any]]], folder: Path) -> None:
-    """Say so if trials come from several states of the code, or from another than this one."""
+    """Warn of trials that were run with other code."""
     from xop_lerobot.evaluation.study import compute_code_digest  # noqa: PLC0415
 
     others = {record["code"] for trials in found for record in trials} - {compute_code_digest()}
@@ -260,7 +260,7 @@ def _warn_of_mixture(found: Sequence[Sequence[Mapping[str, Any]]], folder: Path)
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as text, a line each."""
+    """The rows as text, one line each."""
     head = ("robot", "task", "method", "low level", "success", "pickup", "collis.", "falls",
             "CT [s]", "ABP [W]", "tilt [rad]", "jerk [m/s3]", "note")  # fmt: skip
     lines: list[tuple[str, ...]] = [head]

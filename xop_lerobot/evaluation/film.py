@@ -1,4 +1,4 @@
-"""Pictures of an episode: a strip of labelled moments, a film and a small moving picture."""
+"""Images of an episode: a strip of labelled moments, a video and a GIF."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def choose_moments(count: int, number: int = 8) -> np.ndarray:
 
 
 def build_strip(cameras: Mapping[str, np.ndarray], fps: int, number: int = 8) -> np.ndarray:
-    """Lay moments of an episode side by side, one row a camera, each with its time.
+    """Put moments of an episode side by side, one row per camera, with their times.
 
     Args:
         cameras: Frames of each camera, all equally long. Shapes (T, height, width, 3), uint8.
@@ -55,7 +55,7 @@ def build_strip(cameras: Mapping[str, np.ndarray], fps: int, number: int = 8) ->
 def write_strip(
     path: Path, cameras: Mapping[str, np.ndarray], fps: int, number: int = 8
 ) -> np.ndarray:
-    """Write the strip of `cameras` as a picture and return it; arguments as in `build_strip`."""
+    """Write the strip of `cameras` as an image and return it; arguments as in `build_strip`."""
     strip = build_strip(cameras, fps, number)
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(strip).save(path)
@@ -63,7 +63,7 @@ def write_strip(
 
 
 def build_film(cameras: Mapping[str, np.ndarray], fps: int) -> Iterable[np.ndarray]:
-    """Yield one picture a frame with all cameras side by side, even in width and height."""
+    """Yield one image per frame with all cameras side by side, of even width and height."""
     count = check_cameras(cameras)
     for index in range(count):
         cells = [
@@ -77,7 +77,7 @@ def build_film(cameras: Mapping[str, np.ndarray], fps: int) -> Iterable[np.ndarr
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
-    """Write `frames` as an H.264 film that browsers play, and return their number.
+    """Write `frames` as an H.264 video for browsers, and return their number.
 
     Args:
         path: File to write, ``.mp4``.
@@ -105,7 +105,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
 
 
 def write_gif(path: Path, frames: Iterable[np.ndarray], fps: int, every: int = 3) -> int:
-    """Write every `every`-th picture as a looping GIF of true speed, and return their number."""
+    """Write every `every`-th image as a looping real-time GIF, and return their number."""
     pictures = [
         Image.fromarray(frame).quantize(96)
         for index, frame in enumerate(frames)
@@ -172,7 +172,7 @@ def check_cameras(cameras: Mapping[str, np.ndarray]) -> int:
 
 
 def _put_label(picture: np.ndarray, text: str) -> np.ndarray:
-    """Put a line of black text on white over `picture`."""
+    """Add a line of black text on white above `picture`."""
     height, width = picture.shape[:2]
     canvas = Image.new("RGB", (width, height + LABEL_HEIGHT), "white")
     canvas.paste(Image.fromarray(picture), (0, LABEL_HEIGHT))
@@ -188,7 +188,7 @@ def _pad(picture: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _join(pictures: list[np.ndarray], axis: int) -> np.ndarray:
-    """Join pictures with a white gap between them."""
+    """Join images with a white gap between them."""
     shape = list(pictures[0].shape)
     shape[axis] = GAP
     gap = np.full(shape, 255, np.uint8)

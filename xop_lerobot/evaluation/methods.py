@@ -1,4 +1,4 @@
-"""The methods that are compared, and the variants they come in, by name.
+"""Methods and variants of a study, by name.
 
 A method is a retargeter with a low-level policy. A variant is what a user could also set for it:
 a binding that the robot names, constraints, a preset, with underscores between
@@ -126,7 +126,7 @@ def resolve_low_level(morphology: Morphology, method: str, low_level: str = "") 
 
 
 def find_absence(low_level: str, path: str = "") -> str:
-    """Say why a low-level policy cannot run here; empty where it can."""
+    """Reason why a low-level policy cannot run here; empty if it can."""
     try:
         make_policy(low_level, path or None)
     except PolicyFileError as error:

@@ -1,4 +1,4 @@
-"""Plots of a study: rates with Wilson's intervals, means with a bootstrap's, the head's ways."""
+"""Plots of a study: rates with Wilson's intervals, means with bootstrap intervals, head paths."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def plot_rates(cells: Mapping[str, tuple[str, Trials]]) -> bytes:
 
 
 def plot_means(cells: Mapping[str, tuple[str, Trials]]) -> bytes | None:
-    """Draw every trial's figures, their mean and its 95% interval.
+    """Draw every trial's metrics, their mean and its 95% interval.
 
     Completion times are of successful trials alone. A figure that no trial has is left out.
 
@@ -135,7 +135,7 @@ def plot_means(cells: Mapping[str, tuple[str, Trials]]) -> bytes | None:
 
 
 def find_values(trials: Trials, name: str) -> list[float]:
-    """Values of a figure; completion times of successful trials alone."""
+    """Values of a metric; completion times of successful trials only."""
     if name == "completion_s":
         return [trial[name] for trial in trials if trial["success"]]
     found = (trial["metrics"].get(name) for trial in trials)
@@ -143,7 +143,7 @@ def find_values(trials: Trials, name: str) -> list[float]:
 
 
 def plot_ways(cells: Mapping[str, tuple[str, Trials]]) -> bytes:
-    """Draw the way of the head, seen from above, in every trial of each cell.
+    """Draw the path of the head, seen from above, in every trial of each cell.
 
     Args:
         cells: As in `plot_rates`.

@@ -1,4 +1,4 @@
-"""What the paper reports: 10 trials a row, human operators with a real headset.
+"""Results of the paper: 10 trials per row, human operators with a real headset.
 
 From Tables II to IV of the paper. They stand beside ours for orientation: its operators, rooms
 and points are not ours, and its AMO and FALCON are the released networks.

@@ -1,4 +1,4 @@
-"""The page of a study: tables beside the paper's, plots with intervals, a film of each cell.
+"""Page of a study: tables beside the paper's, plots with intervals, a video of each cell.
 
 One HTML file that needs no other: pictures and films are inside it. The films lie beside it too.
 """
@@ -61,7 +61,7 @@ def load_film(path: Path) -> Film:
 def render_film(
     setup: TrialSetup, seed: int, film: Film, camera: str = CAMERA
 ) -> Iterator[np.ndarray]:
-    """Yield a picture of each position. Shapes (240, 320, 3), uint8.
+    """Yield an image of each position. Shapes (240, 320, 3), uint8.
 
     Args:
         setup: What was tried; its robot, scene and furniture are built anew.
@@ -100,12 +100,12 @@ def _has_walls(model: mujoco.MjModel) -> bool:
 
 
 def _smooth(way: np.ndarray, fps: int) -> np.ndarray:
-    """A way without its sway, for a camera to follow. Shape (p, 2)."""
+    """Smoothed path for a camera to follow. Shape (p, 2)."""
     return gaussian_filter1d(way.astype(float), SMOOTHING_S * fps, axis=0, mode="nearest")
 
 
 def _follow(model: mujoco.MjModel, camera: str, place: np.ndarray) -> None:
-    """Move a camera that stands in the world so that it looks at the robot from near."""
+    """Move a fixed camera to look at the robot from nearby."""
     index = model.camera(camera).id
     back = quat_rotate(model.cam_quat[index], np.array([0.0, 0.0, 1.0]))
     model.cam_pos[index] = np.array([*place, LOOK_HEIGHT]) + DISTANCE * back
@@ -114,7 +114,7 @@ def _follow(model: mujoco.MjModel, camera: str, place: np.ndarray) -> None:
 def write_film(
     path: Path, record: Mapping[str, Any], setup: TrialSetup, film: Film, camera: str = CAMERA
 ) -> int:
-    """Write the film of a trial, with its method and time, and return the number of pictures."""
+    """Write the video of a trial, with its method and time, and return the number of frames."""
     frames = np.stack(list(render_film(setup, record["seed"], film, camera)))
     end = "success" if record["success"] else record["failure"] or "time is up"
     label = f"{setup.method} {setup.variant}".strip()
@@ -221,7 +221,7 @@ def _make_table(
     robot: str,
     task: str,
 ) -> str:
-    """The table of one task of one robot; columns in which nothing stands are left out."""
+    """Table of one task of one robot, without empty columns."""
     lines: list[tuple[str, str, list[str]]] = []  # class, title and fields of each row
     for cell, trials, row in zip(cells, found, rows, strict=True):
         title = f"<b>{escape(label_cell(cell, cells))}</b><br><small>"

@@ -40,7 +40,7 @@ FILM_HZ = 25
 
 @dataclass(frozen=True)
 class TrialSetup:
-    """What is tried, but for the seed.
+    """Configuration of a trial, except the seed.
 
     Attributes:
         robot: Name of the robot.
@@ -71,12 +71,12 @@ class TrialSetup:
 
     @property
     def place(self) -> str:
-        """The task, with its heights where they are not its own, in words."""
+        """The task, with its heights if they are not the default, in words."""
         return f"{self.task} {self.heights}".strip()
 
     @property
     def resolved(self) -> TrialSetup:
-        """With the names that empty ones stand for.
+        """Copy with the defaults of empty names filled in.
 
         Raises:
             UnknownName: If a name is unknown, listing the known ones.
@@ -95,7 +95,7 @@ class TrialSetup:
 
 @dataclass(frozen=True)
 class Trace:
-    """What happened, tick by tick, all of it true and not measured. n ticks.
+    """True trajectory of a trial, tick by tick. n ticks.
 
     Attributes:
         time: Robot's clock [s]. Shape (n,).
@@ -134,7 +134,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Film:
-    """Positions of everything in the scene, from which pictures can be made later.
+    """Positions of everything in the scene, to render images later.
 
     Attributes:
         fps: Pictures per second [Hz].
@@ -216,7 +216,7 @@ class TraceRows:
             self.solves.append((health.get("solve_time", 0.0), failed != Status.OK, intervened > 0))
 
     def make_trace(self) -> Trace:
-        """Put the ticks together."""
+        """Stack the ticks."""
         columns: dict[str, Any] = {}
         for name, first in self.ticks[0].items():
             values = [tick[name] for tick in self.ticks]
@@ -231,7 +231,7 @@ class TraceRows:
 
 
 class _Filming:
-    """Notes the positions of the whole scene, 25 times a second or less."""
+    """Records the positions of the whole scene, at most 25 times a second."""
 
     def __init__(self, stage: Stage, fps: int) -> None:
         self._data = stage.plant.data
@@ -241,7 +241,7 @@ class _Filming:
         self._rows: list[tuple[np.ndarray, ...]] = []
 
     def note(self) -> None:
-        """Note what is where, if it is time to."""
+        """Record the positions, if due."""
         if self._count % self._every == 0:
             data = self._data
             self._rows.append(
@@ -253,7 +253,7 @@ class _Filming:
         self._count += 1
 
     def make_film(self) -> Film:
-        """Put the pictures together."""
+        """Stack the positions."""
         return Film(self.fps, *(np.stack(column) for column in zip(*self._rows, strict=True)))
 
 
