@@ -31,11 +31,11 @@ LENGTHS = ("eye_height", "arm_reach")
 
 
 class EngageRefused(XopError):
-    """The operator cannot engage now; the message says why."""
+    """The operator cannot engage now; the message gives the reason."""
 
 
 class NotEngaged(XopError):
-    """Goals are asked for while nobody is engaged."""
+    """Goals were requested while no operator is engaged."""
 
     def __init__(self) -> None:
         super().__init__("the operator is not engaged. Call engage() first.")
@@ -43,7 +43,7 @@ class NotEngaged(XopError):
 
 @dataclass
 class AlignmentConfig:
-    """How the operator's motion is scaled to the robot.
+    """Scales from the operator's motion to the robot's.
 
     Attributes:
         height_scale: Robot's over operator's change of head height; None is the ratio of the
@@ -93,7 +93,7 @@ def is_lost(frame: OperatorFrame) -> bool:
 
 @dataclass(frozen=True)
 class _Anchor:
-    """What was measured at engage.
+    """Measurements at engage.
 
     Attributes:
         operator: Head of the operator. Shape (7,).
@@ -111,7 +111,7 @@ class _Anchor:
 
 
 class Alignment:
-    r"""Lays the operator's head and heading on the robot's at engage, and follows from there.
+    r"""Aligns the operator's head and heading with the robot's at engage, and follows from there.
 
     With A the turn about the vertical that aligns the headings, ₀ the values at engage, ``o``
     the operator and ``r`` the robot:
@@ -137,7 +137,7 @@ class Alignment:
 
     @property
     def is_engaged(self) -> bool:
-        """Whether the operator's motion makes goals."""
+        """Whether the operator is engaged."""
         return self._anchor is not None
 
     @property
@@ -158,7 +158,7 @@ class Alignment:
         robot_head_height: float,
         robot_reach: float | None = None,
     ) -> None:
-        """Lay the operator's head and heading on the robot's, measured now.
+        """Align the operator's head and heading with the robot's, as measured now.
 
         Args:
             frame: The operator now.
@@ -192,12 +192,12 @@ class Alignment:
         self.goal_poses(frame)
 
     def disengage(self) -> None:
-        """Forget the alignment; the next `engage` makes a new one."""
+        """Discard the alignment; the next `engage` makes a new one."""
         self._anchor = None
         self._goals, self._from_head = {}, {}
 
     def goal_poses(self, frame: OperatorFrame) -> dict[str, np.ndarray]:
-        """Compute where the operator wants the frames, in the robot's world.
+        """Desired poses of the frames in the robot's world.
 
         While the head is not tracked the last goals are returned; see `is_lost`.
 

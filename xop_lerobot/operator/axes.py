@@ -1,4 +1,4 @@
-"""The world that headsets speak of, which is the same for ARKit and for WebXR."""
+"""Axes of the headsets' world, the same for ARKit and WebXR."""
 
 from __future__ import annotations
 

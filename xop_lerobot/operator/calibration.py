@@ -1,4 +1,4 @@
-"""Five seconds in which the height of a person's eyes and the reach of the arms are measured."""
+"""Calibration: five seconds that measure a person's eye height and arm reach."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ HINT_S = 2.0
 
 
 class CalibrationFailed(XopError):
-    """The person could not be measured; the message says why."""
+    """The person could not be measured; the message gives the reason."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What is measured of a person.
+    """Measurements of a person.
 
     Attributes:
         eye_height: Height of the head's frame over the floor, standing upright [m].
@@ -92,7 +92,7 @@ def load_calibration(path: Path) -> Calibration:
 
 
 class Step(Enum):
-    """What the person does now."""
+    """Step of the calibration."""
 
     WAIT = "Waiting for the headset."
     STAND = "Stand upright and look straight ahead."
@@ -101,7 +101,7 @@ class Step(Enum):
 
 
 class Guide:
-    """Leads through the calibration, frame by frame; only stamps count.
+    """State machine of the calibration, driven by frames and their stamps.
 
     Attributes:
         step: What the person does now.
@@ -178,7 +178,7 @@ class Guide:
 
 
 def _find_fault(frame: OperatorFrame, arms: np.ndarray) -> str:
-    """Why arms are not stretched forward; empty if they are. `arms`: (2, 3) from the head."""
+    """Reason why `arms` are not stretched forward, (2, 3) from the head; empty if they are."""
     if not frame.tracked.all():
         return "A hand is not seen."
     middle = arms.mean(axis=0)
@@ -203,7 +203,7 @@ def calibrate(
     sleep: Callable[[float], None],
     patience_s: float = 120.0,
 ) -> Calibration:
-    """Lead the person in the headset through the calibration.
+    """Guide the person in the headset through the calibration.
 
     What to do is said, and shown in the headset.
 

@@ -51,7 +51,7 @@ def is_dataset(path: str | Path) -> bool:
 
 
 def load_dataset_recording(root: str | Path, episode: int = 0) -> Recording:
-    """Read what the operator did in one episode, from the moment of engaging.
+    """Read the operator's motion in one episode, from the first engagement.
 
     The mode is what the robot was told (`mode.pos` of the action), so that the same motion
     drives another robot in the same modes.
@@ -74,7 +74,7 @@ def load_dataset_recording(root: str | Path, episode: int = 0) -> Recording:
 
 
 def choose_columns(root: object, features: Mapping[str, Any]) -> list[str]:
-    """Name the columns that a recording is made from.
+    """Names of the columns of a recording.
 
     Args:
         root: The dataset, for the message.
@@ -175,7 +175,7 @@ def _is_pose(poses: np.ndarray) -> np.ndarray:
 
 
 def _find_leaps(columns: Mapping[str, np.ndarray], span: np.ndarray) -> np.ndarray:
-    """Find the rows in which a limb is elsewhere than in the row before. Shape (n,), bool."""
+    """Find the rows in which a limb has jumped since the row before. Shape (n,), bool."""
     leaps = np.zeros(len(span), bool)
     tracked = columns["operator.tracked"][span] > 0
     for limb, frame in enumerate(FRAMES):
@@ -189,7 +189,7 @@ def _find_leaps(columns: Mapping[str, np.ndarray], span: np.ndarray) -> np.ndarr
 def _choose_clock(
     clocks: Mapping[str, np.ndarray], moved: np.ndarray, source: object, fps: float | None
 ) -> RowClock | None:
-    """Choose the best clock that runs, at about the rate of the rows; None if there is none.
+    """Choose the best running clock with about the rate of the rows; None if there is none.
 
     Args:
         clocks: Columns of `CLOCKS`. Shapes (n,).

@@ -11,7 +11,7 @@ from xop_lerobot.operator.frame import OperatorFrame
 
 
 class Device(ABC):
-    """A source of operator frames. Nothing behind it knows which device it was.
+    """A source of operator frames; nothing behind it depends on the device.
 
     Attributes:
         self_engaging: Whether the device engages by itself once the robot has settled
@@ -24,7 +24,7 @@ class Device(ABC):
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the device now, in words; empty if nothing is."""
+        """Present fault of the device in words; empty if none."""
         return ""
 
     def connect(self) -> None:
@@ -34,7 +34,7 @@ class Device(ABC):
         """Close the device; may be called twice."""
 
     def begin_episode(self, index: int) -> None:
-        """Be told that episode `index` of a session begins, so that it is the same every time."""
+        """Prepare episode `index` of a session, reproducibly."""
         del index
 
     def start(self, time: float) -> None:
@@ -50,22 +50,22 @@ class Device(ABC):
         return False
 
     def is_paused(self, time: float) -> bool:
-        """Whether the person, though seen, lets go of the robot for now; the robot holds."""
+        """Whether the tracked person has paused driving; the robot holds."""
         del time
         return False
 
     def see(self, view: View) -> None:
-        """Look at the robot and what is about it; only a simulated person needs to."""
+        """Show the robot and its surroundings to a simulated person."""
         del view
 
     def introduce(self, robot: str, gestures: Mapping[str, str]) -> None:
-        """Be told the name of the robot and, by name, how to ask for what; headsets tell it."""
+        """Receive the robot's name and the explanations of the gestures, for display."""
         del robot, gestures
 
     def show(self, display: Display) -> None:
-        """Show the wearer the robot and the recording, once a tick; only headsets can."""
+        """Display robot and recording to the operator, once a tick; headsets only."""
         del display
 
     def take_wishes(self) -> tuple[Wish, ...]:
-        """What was asked for of the recording, by buttons, since the last call."""
+        """Requests to the recorder, by buttons, since the last call."""
         return ()

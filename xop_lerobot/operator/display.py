@@ -1,4 +1,4 @@
-"""What a headset shows its wearer of the robot, and what its wearer wants of the recording."""
+"""Display of a headset, notices, and the operator's requests to the recorder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_ALIKE = 2
 
 
 class Cue(Enum):
-    """What has happened; a headset has a sound for each."""
+    """Kind of a notice; a headset has a sound for each."""
 
     ENGAGED = "engaged"
     DISENGAGED = "disengaged"
@@ -34,7 +34,7 @@ class Cue(Enum):
 
 
 class Wish(Enum):
-    """What the operator wants of the episode that is recorded."""
+    """Request of the operator concerning the episode being recorded."""
 
     END = "end"
     """Save it, and go on with the next."""
@@ -48,7 +48,7 @@ class Wish(Enum):
 
 @dataclass(frozen=True)
 class Notice:
-    """One thing that the operator is told.
+    """One notice to the operator.
 
     Attributes:
         number: Counts up, so that each is shown and sounded once.
@@ -62,7 +62,7 @@ class Notice:
 
 
 class NoticeBoard:
-    """The last few notices; new ones are numbered on.
+    """The last notices, numbered consecutively.
 
     Of one cue there are at most two, so that what happens all the time, as settings that a
     program changes, drives nothing else from the board; the log is paced for the same reason.
@@ -82,7 +82,7 @@ class NoticeBoard:
         self._notices.append(Notice(self._count, cue, text))
 
     def tell(self, cue: Cue, text: str) -> None:
-        """Add a notice, and log it for who sits at the terminal."""
+        """Add a notice, and log it to the terminal."""
         self._log.info(text)
         self.post(cue, text)
 
@@ -94,7 +94,7 @@ class NoticeBoard:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a recording is.
+    """Progress of a recording.
 
     Attributes:
         episode: Index of the episode that is recorded.
@@ -113,7 +113,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Display:
-    """All that a headset can show of one tick.
+    """Content of a headset's display for one tick.
 
     Attributes:
         time: Clock of the robot [s].
@@ -142,7 +142,7 @@ class Display:
 
 @dataclass(frozen=True)
 class SeenObject:
-    """A thing in the robot's world.
+    """An object in the robot's world.
 
     Attributes:
         pose: Pose of its middle, robot's world, x y z qw qx qy qz. Shape (7,).

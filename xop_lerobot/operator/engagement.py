@@ -1,4 +1,4 @@
-"""Who drives: engagements begin and end as the device, or the person in the headset, asks."""
+"""Engagement: begins and ends on request of the device or of the person in the headset."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PALM_UP = -0.5
 
 @dataclass
 class ClutchConfig:
-    """How a person engages and lets go.
+    """Settings of the gesture that engages and disengages.
 
     Attributes:
         gesture: What is held, one of `GESTURES`. Grippers close with pinches, so with
@@ -66,7 +66,7 @@ class ClutchConfig:
 
 
 class Wish(Enum):
-    """What the clutch asks for."""
+    """Request of the clutch."""
 
     NOTHING = "nothing"
     ENGAGE = "engage"
@@ -74,7 +74,7 @@ class Wish(Enum):
 
 
 class Clutch:
-    """Tells from the frames alone when to engage and when to let go.
+    """Detects from the frames when to engage and disengage.
 
     The gesture counts when it was held for `hold` seconds, with both hands seen and still. It
     then asks until it is granted, which `update` is told by `engaged`, and no more until the
@@ -171,7 +171,7 @@ UNSEEN = "the headset has lost its position, or sends nothing"
 
 
 class Engagement:
-    """Engages the operator, and lets go of the robot again.
+    """Engages and disengages the operator.
 
     A device that engages by itself does so as soon as the robot has settled. Who wears a headset
     engages, and lets go, by the gesture of the clutch. Loss of the head's tracking, a fall and
@@ -207,7 +207,7 @@ class Engagement:
         self.reset()
 
     def reset(self) -> None:
-        """Start over: nobody is engaged, and nobody has been refused."""
+        """Reset: not engaged, no refusal pending."""
         self.alignment.disengage()
         if self.clutch is not None:
             self.clutch.reset()
@@ -221,13 +221,13 @@ class Engagement:
 
     @property
     def progress(self) -> float:
-        """How much of the clutch's hold has passed, from 0 to 1."""
+        """Progress of the clutch's hold, 0 to 1."""
         return 0.0 if self.clutch is None else self.clutch.progress
 
     def follow(
         self, state: RobotState, frame: OperatorFrame | None, poses: Mapping[str, np.ndarray]
     ) -> OperatorFrame | None:
-        """Engage or disengage where it is time to.
+        """Engage or disengage if requested.
 
         Args:
             state: The robot now.
@@ -261,7 +261,7 @@ class Engagement:
     def _engage_itself(
         self, state: RobotState, frame: OperatorFrame, poses: Mapping[str, np.ndarray]
     ) -> None:
-        """Engage; a refusal is a fault of the set-up at first, and waited out later on."""
+        """Engage; a refusal is an error the first time, and retried later."""
         try:
             self.engage(state, frame, poses)
         except EngageRefused as refusal:
@@ -278,7 +278,7 @@ class Engagement:
         frame: OperatorFrame | None,
         poses: Mapping[str, np.ndarray],
     ) -> None:
-        """Engage and let go as the person in the headset asks."""
+        """Engage and disengage on the gesture of the person in the headset."""
         wish = clutch.update(frame, self.is_engaged)
         if self.is_engaged:
             if state.fallen:
@@ -315,7 +315,7 @@ class Engagement:
         )
 
     def _refuse(self, refusal: str) -> None:
-        """Tell why nobody engages, once for each gesture that asks for it."""
+        """Report why engaging is refused, once per gesture."""
         if refusal != self._refusal:
             self._board.tell(Cue.REFUSED, refusal)
         self._refusal = refusal
@@ -340,6 +340,6 @@ class Engagement:
         self._end()
 
     def _spend(self) -> None:
-        """The gesture has had its effect: what is held of it from now on does nothing."""
+        """Mark the gesture as used; holding it longer has no effect."""
         if self.clutch is not None:
             self.clutch.progress = 0.0

@@ -1,4 +1,4 @@
-"""What the operator is told in words: what has changed, and what is wrong now."""
+"""Feedback to the operator in words: changes and warnings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LATE_S = 0.3
 
 
 def tell_changes(board: NoticeBoard, changes: Iterable[AppliedChange]) -> None:
-    """Tell what has come into force in a tick: the mode with its own cue, and the rest in one."""
+    """Notify of changes in a tick: the mode with its own notice, the rest in one."""
     changed = [each.change for each in changes]
     modes = [change.mode for change in changed if change.mode is not None]
     if modes:
@@ -33,7 +33,7 @@ def tell_changes(board: NoticeBoard, changes: Iterable[AppliedChange]) -> None:
 
 
 def describe_settings(change: Change) -> str:
-    """Describe what `change` does but for the mode; empty if it does nothing else."""
+    """Describe `change` except for the mode; empty if there is nothing else."""
     parts = [
         f"constraint {name} {'on' if on else 'off'}" for name, on in change.constraints.items()
     ]
@@ -58,7 +58,7 @@ def list_warnings(
     plan_age: float | None,
     trouble: str = "",
 ) -> tuple[str, ...]:
-    """List what is wrong now, the worst first.
+    """List the present warnings, the worst first.
 
     Args:
         device: Where the operator's motion comes from.

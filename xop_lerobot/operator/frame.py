@@ -1,4 +1,4 @@
-"""One sample of what a headset streams, in the one convention that all devices convert to."""
+"""One sample of a headset's stream, in the convention that all devices convert to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gestures: double pinches of one hand or of both, raised hands, and what they ask for.
+"""Gestures: double pinches of one or both hands, raised hands, and their effects.
 
 Requests go to the robot (engage, let go, change the mode) and to the recording.
 """
@@ -40,7 +40,7 @@ def grip_from_pinch(distance: np.ndarray | float) -> np.ndarray:
 
 @dataclass
 class DoublePinchConfig:
-    """When two pinches count as a double pinch.
+    """Limits of a double pinch.
 
     Attributes:
         hand: The hand that toggles, ``"left"`` or ``"right"``.
@@ -91,7 +91,7 @@ class DoublePinchConfig:
 
 
 class DoublePinchDetector:
-    """Tells double pinches from grasps, by the stamps of the samples alone.
+    """Distinguishes double pinches from grasps by the stamps of the samples.
 
     Pinches with at most `max_gap` between them are one burst. A burst of exactly two clean
     pinches is a double pinch; a pinch that is too short or too long, a hand that is lost or
@@ -193,7 +193,7 @@ class DoublePinchDetector:
 
 
 class Gesture(Enum):
-    """What the operator's hands say."""
+    """Gesture of the operator's hands."""
 
     DOUBLE_PINCH = "double_pinch"
     OTHER_DOUBLE_PINCH = "other_double_pinch"
@@ -206,7 +206,7 @@ OTHER_PINCHES = ("success", "none")
 
 @dataclass
 class GestureConfig:
-    """What the gestures do.
+    """Effects of the gestures.
 
     Attributes:
         double_pinch: When two pinches of one hand count; they toggle the mode.
@@ -246,7 +246,7 @@ class GestureConfig:
 
 
 class GestureReader:
-    """Tells double pinches of either hand from those of both hands.
+    """Distinguishes double pinches of one hand from those of both.
 
     The double pinch of one hand counts at once, unless the other hand is just pinching too or
     has just done so: then it counts when that is decided, as one of both hands or of its own.
@@ -292,7 +292,7 @@ class GestureReader:
 
 
 class Asked(NamedTuple):
-    """What the gestures that are complete with a frame ask for."""
+    """Requests of the gestures completed by a frame."""
 
     mode: bool = False
     """To toggle the mode."""
@@ -303,7 +303,7 @@ class Asked(NamedTuple):
 
 
 class Hands:
-    """Reads all gestures but the clutch's, whether the operator drives or not.
+    """Reads all gestures except the clutch's, engaged or not.
 
     Args:
         config: What the gestures do.

@@ -1,4 +1,4 @@
-"""How goals come about: how fast they move, and how a hand that is found again is taken up."""
+"""Goals: their velocity, and blending when a lost hand is found again."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SETBACK_SPEED = 1.0
 
 @dataclass(frozen=True)
 class _Way:
-    """A goal on its way to a hand.
+    """A goal that blends towards a hand.
 
     Attributes:
         begin: When it set out, or went on after a loss [s].
@@ -45,7 +45,7 @@ class _Way:
 
 
 class HandBlend:
-    """Leads goals of hands from where they stood, seen from the head, to where the hands are.
+    """Blends goals of hands from their held pose relative to the head to the tracked hands.
 
     While a hand is lost its goal stands still (`Alignment`). From the first frame in which it
     is seen again, and from an engagement on, the goal goes with the hand, at an offset that
@@ -113,7 +113,7 @@ class HandBlend:
         return blended
 
     def _lead(self, time: float, name: str, goal: np.ndarray, seen: bool) -> np.ndarray:
-        """Where the goal of a hand goes, seen from the head. Shape (7,)."""
+        """Goal of a hand relative to the head. Shape (7,)."""
         if not seen:
             if name not in self._lost:
                 self._lost[name] = time, self._compute_phase(time, name)
@@ -131,7 +131,7 @@ class HandBlend:
         return make_pose(goal[:3] + share * way.offset[:3], turned)
 
     def _find(self, time: float, name: str, goal: np.ndarray) -> None:
-        """A hand is seen again: its goal sets out for it, or goes on."""
+        """Start or continue blending towards a hand that is seen again."""
         since, phase = self._lost.pop(name)
         away = float(np.linalg.norm(goal[:3] - self._seen.get(name, goal)[:3]))
         setback = max(SETBACK * (time - since), away / SETBACK_SPEED) / self.duration
@@ -139,7 +139,7 @@ class HandBlend:
         self._ways[name] = _Way(time, max(phase - setback, 0.0), offset)
 
     def _compute_phase(self, time: float, name: str) -> float:
-        """How much of the time of a hand's way has passed, 1 where it is on none."""
+        """Elapsed share of a hand's blend, 1 if there is none."""
         if name not in self._ways:
             return 1.0
         way = self._ways[name]
@@ -200,7 +200,7 @@ class GoalVelocity:
         self._velocities: dict[str, np.ndarray] = {}
 
     def update(self, time: float, poses: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Take the goals of `time` and return how fast they move.
+        """Update with the goals of `time` and return their velocities.
 
         Args:
             time: The robot's clock [s].

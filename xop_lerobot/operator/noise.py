@@ -1,4 +1,4 @@
-"""What a person's body does by itself: sway of a standing person, tremor of a held hand."""
+"""Involuntary motion of a person: postural sway and hand tremor."""
 
 from __future__ import annotations
 

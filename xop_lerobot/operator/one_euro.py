@@ -1,4 +1,4 @@
-"""The one-euro filter: a hand that rests is calm, and one that moves is not late."""
+"""One-euro filter: smooth at rest, little lag in motion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xop_lerobot.operator.frame import OperatorFrame
 
 @dataclass
 class OneEuroConfig:
-    """How much is smoothed.
+    """Settings of the one-euro filter.
 
     Attributes:
         min_cutoff: Cut-off frequency of what rests [Hz]; lower ones calm more.
@@ -106,7 +106,7 @@ def _compute_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 class OneEuro:
-    """Smooths head and wrists of a stream; a limb that is lost begins anew when it is seen.
+    """Smooths head and wrists of a stream; a lost limb restarts when it is seen again.
 
     Pinches stay as they are: their thresholds have a hysteresis of their own.
 

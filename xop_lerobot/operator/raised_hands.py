@@ -1,4 +1,4 @@
-"""A raised hand that pinches and holds still asks something of the recording."""
+"""Raised hands: gestures that control the recording."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HOLDING = {
 
 @dataclass
 class RaisedHandsConfig:
-    """Which hand is raised for what, ``"left"``, ``"right"``, ``"both"`` or ``"none"``.
+    """Hand of each request, ``"left"``, ``"right"``, ``"both"`` or ``"none"``.
 
     Attributes:
         end: Raised to end the episode: it is saved.
@@ -120,12 +120,12 @@ class _Hand:
             self._place = wrist[:3].copy()
 
     def spend(self) -> None:
-        """The gesture has had its effect; the next one begins with an open hand."""
+        """Mark the gesture as used; the next one begins with an open hand."""
         self._ready, self._place = False, None
 
 
 class RaisedHands:
-    """Tells from the frames alone what the operator asks of the recording.
+    """Detects from the frames the operator's requests to the recorder.
 
     A hand is raised as if to say "halt": fingers up, palm away from the person. It closes
     thumb and index there, and is held still. What is asked for depends on which hands are
@@ -159,7 +159,7 @@ class RaisedHands:
         """How much of its hold has passed, from 0 to 1."""
 
     def update(self, frame: OperatorFrame | None) -> Wish | None:
-        """Take one sample; return what is asked for with it, once for each gesture.
+        """Take one sample; return its request, once per gesture.
 
         Frames with the stamp of the last one change nothing; a stamp that goes back starts anew.
 
@@ -198,7 +198,7 @@ class RaisedHands:
         return wish
 
     def _find_wish(self) -> Wish | None:
-        """What the hands ask for now: all that are raised must be closed."""
+        """Present request of the hands; all raised hands must be closed."""
         raised = [hand.raised for hand in self._hands]
         if not any(raised) or [hand.closed for hand in self._hands] != raised:
             return None

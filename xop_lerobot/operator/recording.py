@@ -1,4 +1,4 @@
-"""A recorded person: poses of head and wrists over time, checked before anything moves."""
+"""Operator recordings: poses of head and wrists over time, checked before use."""
 
 from __future__ import annotations
 

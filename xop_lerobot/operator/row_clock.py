@@ -1,4 +1,4 @@
-"""The time of recorded rows by a clock that somebody may have set while they were recorded."""
+"""Time of recorded rows by a clock that may have been set during the recording."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RowClock(NamedTuple):
 def read_row_clock(
     ticks: np.ndarray, unit: float = 1.0, moved: np.ndarray | None = None
 ) -> RowClock:
-    """Read a clock without the jumps that it makes when somebody sets it.
+    """Read a clock without the jumps of its adjustments.
 
     A board without a battery begins in 1970 until the network tells the time, and an hour that is
     wrong is set right: from one row to the next the clock goes back, or on by more than any

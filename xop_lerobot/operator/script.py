@@ -65,7 +65,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Script:
-    """What a scripted person does.
+    """Content of an operator script.
 
     Attributes:
         duration: Length [s].

@@ -1,4 +1,4 @@
-"""What of a live stream can be believed: each limb is judged, and each refusal counted."""
+"""Plausibility checks of a live stream: each limb is checked, and each rejection counted."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ OPEN_PINCH = 0.08
 
 @dataclass
 class GuardConfig:
-    """What counts as a fault of the stream.
+    """Limits of the plausibility checks.
 
     Attributes:
         stale: Without a new believable frame for so long, the head counts as lost [s].
@@ -91,7 +91,7 @@ class GuardConfig:
 
 
 def _find_nonsense(pose: np.ndarray) -> str | None:
-    """Why `pose` can be the pose of nobody, None if it can. Shape (7,)."""
+    """Reason why `pose` is impossible, None if it is possible. Shape (7,)."""
     if not np.isfinite(pose).all():
         return "not_finite"
     if abs(float(np.linalg.norm(pose[3:])) - 1) > NORM_TOLERANCE:
@@ -100,7 +100,7 @@ def _find_nonsense(pose: np.ndarray) -> str | None:
 
 
 class LimbGuard:
-    r"""Judges the poses of one limb in turn.
+    r"""Checks the successive poses of one limb.
 
     A pose is a jump if it is farther from the last believed one than
     :math:`v_{max} dt + slack`, dt from 1/90 to 0.04 s, or turned by more than the like. Poses that
@@ -134,7 +134,7 @@ class LimbGuard:
     def judge(
         self, time: float, pose: np.ndarray, frozen: float, jumped: bool = False
     ) -> str | None:
-        """Take the pose of `time` [s]; return why it is not believed, None if it is.
+        """Check the pose of `time` [s]; return the reason of a rejection, None if it is accepted.
 
         Args:
             time: Stamp of the frame [s].
@@ -164,7 +164,7 @@ class LimbGuard:
         return None
 
     def compute_rate(self, time: float) -> float | None:
-        """How often the pose has changed lately [Hz]; None where it stands, or is new."""
+        """Recent rate of change of the pose [Hz]; None if it is constant or new."""
         changes = self._changes
         if len(changes) < RENEWALS or time - changes[-1] > RENEWAL_S:
             return None
@@ -193,7 +193,7 @@ class LimbGuard:
 
 
 def compute_step(last: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
-    """Way [m] and angle [rad] from one pose to another. Shapes (7,)."""
+    """Distance [m] and angle [rad] between two poses. Shapes (7,)."""
     turn = rotation_error(pose[3:], last[3:])
     return float(np.linalg.norm(pose[:3] - last[:3])), float(np.linalg.norm(turn))
 
@@ -215,7 +215,7 @@ def goes_along(before: np.ndarray, after: np.ndarray, last: np.ndarray, pose: np
 
 
 class StreamGuard:
-    """Turns what a device sends into frames that can be believed.
+    """Turns a device's messages into plausible frames.
 
     A frame whose head cannot be believed is dropped; when that goes on, the stream is stale. A
     hand that cannot be believed is marked as lost, and its pose and pinch stay as they were
@@ -253,7 +253,7 @@ class StreamGuard:
 
     @property
     def relocations(self) -> int:
-        """How often the head has turned out to be elsewhere; it is aligned anew then."""
+        """Number of relocations of the head; each one requires a new alignment."""
         return self._limbs[0].relocations
 
     def compute_hand_rates(self, time: float) -> tuple[float | None, float | None]:

@@ -101,7 +101,7 @@ class BoxPickAndPlace(Task):
 
     @property
     def height_limits(self) -> Mapping[str, HeightRange]:
-        """Where the tops of support and table may be."""
+        """Allowed heights of the tops of support and table."""
         level = self.reach.height - BOX[2]
         usual = (level + LEVELS["table"][0], level + LEVELS["support"][1])
         return dict.fromkeys(self.furniture, self.morphology.top_heights or usual)
@@ -152,7 +152,7 @@ class BoxPickAndPlace(Task):
         return BOX[0] + SPOT - TABLE[0]
 
     def bind(self, plant: Simulation) -> None:
-        """Find what touches the box."""
+        """Find the bodies in contact with the box."""
         self.plant = plant
         self._touching = Touching(plant, "box")
 

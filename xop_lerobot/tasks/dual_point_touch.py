@@ -71,7 +71,7 @@ class DualPointTouch(Task):
 
     @property
     def height_limits(self) -> Mapping[str, HeightRange]:
-        """Where the points may be."""
+        """Allowed heights of the points."""
         spread = HEIGHT_SPREAD + LEVEL_SPREAD
         usual = (self.reach.height - spread, self.reach.height + spread)
         return {"points": self.morphology.point_heights or usual}

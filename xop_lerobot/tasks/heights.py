@@ -1,4 +1,4 @@
-"""Heights that a user asks a task's places to be drawn from."""
+"""Heights of a task's places, as set by the user."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FORM = "NAME=HEIGHT or NAME=LOW:HIGH [m], comma-separated"
 
 
 def parse_heights(text: str) -> dict[str, HeightRange]:
-    """Read heights by the name of what stands there: ``"support=0.35,table=0.6:0.7"``.
+    """Read heights by name: ``"support=0.35,table=0.6:0.7"``.
 
     Args:
         text: A height or a range for each name, with commas between; empty for none.

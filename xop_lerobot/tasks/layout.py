@@ -1,4 +1,4 @@
-"""Where a robot's hands work well, and how things are laid out about it."""
+"""Reach of a robot's hands, and placement of things around it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STEPS, _DT, _NEAR = 50, 0.04, 0.005
 
 @dataclass(frozen=True)
 class Reach:
-    """Where a standing robot has its palms at rest, and how far its arms go.
+    """Palms at rest of a standing robot, and the reach of its arms.
 
     Attributes:
         forward: Palms ahead of the base's frame [m].
@@ -187,7 +187,7 @@ IN_ROOM = ((2.1, -2.1, 2.4), (0.0, 0.0, 0.5), 66.0)
 
 
 def add_task_camera(spec: mujoco.MjSpec) -> None:
-    """Add the camera `task`, which stands still."""
+    """Add the fixed camera `task`."""
     has_walls = any(geom.name.startswith("wall_") for geom in spec.geoms)
     position, target, fovy = IN_ROOM if has_walls else OPEN
     # MuJoCo's cameras look along -Z with Y up.

@@ -1,4 +1,4 @@
-"""A robot, a task and the furniture about them, simulated: what an episode takes place on."""
+"""Task scene: a simulated robot, a task and its furniture."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Stage:
         self.reset(config.seed)
 
     def reset(self, seed: int) -> None:
-        """Place everything as `seed` says; to be called after the plant's own reset."""
+        """Place everything by `seed`; call it after the plant's own reset."""
         with self.plant.lock:
             self.task.reset(np.random.default_rng(np.random.SeedSequence([seed, 1])))
             self.plant.rearrange()
@@ -94,7 +94,7 @@ class Stage:
             self.status = self._judge()
 
     def update(self) -> TaskStatus:
-        """Look at the physics, once per control step."""
+        """Update the task's status from the physics, once per control step."""
         with self.plant.lock:
             self._note_touches()
             self.status = self._judge()
@@ -146,14 +146,14 @@ class Stage:
         self.plant.close()
 
     def _note_touches(self) -> None:
-        """Take down what of the robot has run into what."""
+        """Record the robot's collisions."""
         handled = set(self.task.handled)
         for part, other in self.plant.take_touches():
             if other in self._solid and not (part in self._hands and other in handled):
                 self._collisions.add((part, other))
 
     def _judge(self) -> TaskStatus:
-        """The task's word, and whether the episode is over."""
+        """Verdict of the task, and whether the episode is over."""
         time, fallen = self.plant.time, self.plant.has_fallen
         collisions = tuple(sorted(self._collisions))
         status = dataclasses.replace(self.task.update(), collisions=collisions)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TaskStatus(Outcome):
-    """How far an episode is, decided by the physics alone.
+    """Status of an episode, decided by the physics alone.
 
     Attributes:
         failure: Why the episode is lost, in words; empty while it is not.
@@ -40,7 +40,7 @@ class TaskStatus(Outcome):
 
 
 class Task(ABC):
-    """Something to do: furniture and objects about a robot, and what counts as having done it.
+    """A task: furniture and objects around a robot, and a criterion of success.
 
     `add_to` puts everything into the robot's full model, `bind` finds it again in the compiled
     one, `reset` places it at random, and `update` looks at the physics after every control step.
@@ -76,7 +76,7 @@ class Task(ABC):
 
     @property
     def height_limits(self) -> Mapping[str, HeightRange]:
-        """Heights that a user may ask for, by name, and where the robot can work at them [m]."""
+        """Heights that a user may set, by name, with the robot's range [m]."""
         return {}
 
     def choose_heights(self, text: str) -> None:
@@ -117,12 +117,12 @@ class Task(ABC):
 
     @classmethod
     def choose_scene(cls, morphology: Morphology) -> str:
-        """Name of the scene for a robot, where none is asked for."""
+        """Default scene for a robot."""
         return cls.room if morphology.hull_points else "empty"
 
     @property
     def hints(self) -> Mapping[str, float]:
-        """What a person who practised knows about it, by name; lengths in metres."""
+        """Hints: knowledge of a practised person, by name; lengths in metres."""
         return {}
 
     @property
@@ -140,16 +140,16 @@ class Task(ABC):
 
     @abstractmethod
     def reset(self, rng: np.random.Generator) -> None:
-        """Place everything anew, with the robot at its start; the same draw, the same places."""
+        """Place everything for a new episode, the robot at its start; same draw, same places."""
 
     @abstractmethod
     def update(self) -> TaskStatus:
-        """Look at the physics, once per control step, and tell how far the episode is."""
+        """Return the status of the episode from the physics, once per control step."""
 
     @property
     @abstractmethod
     def objects(self) -> Mapping[str, SeenObject]:
-        """What a person can see of the task, by name."""
+        """Visible objects of the task, by name."""
 
 
 TASKS: Registry[type[Task]] = Registry(
@@ -192,7 +192,7 @@ def get_task(name: str) -> type[Task]:
 
 
 class Hold:
-    """A stopwatch that starts anew whenever its condition is not met.
+    """A stopwatch that restarts whenever its condition is not met.
 
     Args:
         needed: Time for which it has to be met [s].
@@ -203,12 +203,12 @@ class Hold:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew."""
+        """Restart."""
         self._since: float | None = None
         self.duration = 0.0
 
     def update(self, time: float, met: bool) -> bool:
-        """Take down whether the condition is met at `time` [s]; whether it was for long enough."""
+        """Update with the condition at `time` [s]; return whether it has held for long enough."""
         if not met:
             self.reset()
             return False

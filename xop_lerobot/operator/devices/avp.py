@@ -1,4 +1,4 @@
-"""Apple Vision Pro, over the Tracking Streamer app that runs in it.
+"""Apple Vision Pro, through its app Tracking Streamer.
 
 The headset is the server: the rpc `StreamHandUpdates` of `handtracking.HandTrackingService` takes
 one `HandUpdate` and streams more of them. Descriptors are built here, so no generated code is

@@ -1,4 +1,4 @@
-"""Which device drives the robot, and how a recording or script is played."""
+"""Settings of operator devices, playback included."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What live headsets have in common: a thread of their own, the newest frame, and its age."""
+"""Common part of live headsets: a thread of their own, the newest frame, and its age."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class StreamLost(XopError):
 
 @dataclass(frozen=True)
 class StreamStatus:
-    """How the stream is doing.
+    """Status of a stream.
 
     Attributes:
         connected: Whether the device answers.
@@ -69,14 +69,14 @@ class StreamStatus:
 
     @property
     def slow_hands(self) -> tuple[str, ...]:
-        """The hands that change so much less often than frames come that they count as lost."""
+        """Hands whose poses change too rarely, so that they count as lost."""
         slow = min(HAND_HZ, 0.8 * self.rate)
         rates = zip(HANDS, self.hand_rates, strict=True)
         return tuple(side for side, rate in rates if rate is not None and rate < slow)
 
 
 class LiveDevice(Device):
-    """A headset that somebody wears now.
+    """A live headset.
 
     Its stream is read on a thread of its own, as fast as it comes, and each frame is stamped at
     its receipt, judged and smoothed at once; only the newest is kept. So `read` never waits, and
@@ -120,7 +120,7 @@ class LiveDevice(Device):
     @property
     @abstractmethod
     def address(self) -> str:
-        """What it connects to, as it reads in a message."""
+        """Description of the peer, for messages."""
 
     @abstractmethod
     def stream(self) -> None:
@@ -175,7 +175,7 @@ class LiveDevice(Device):
         self._trouble = trouble
 
     def hear(self) -> None:
-        """Note that the device has sent something, whatever it is."""
+        """Note that the device has sent a message of any kind."""
         with self._lock:
             self._heard_at = self.clock()
             if self._connected:
@@ -245,12 +245,12 @@ class LiveDevice(Device):
         return newest
 
     def end_silence(self) -> None:
-        """Do something about a connection over which nothing comes: make it anew."""
+        """Handle a silent connection: reconnect."""
         self._say(f"{self.address}: nothing has come for {SILENT_S:g} s. Reconnecting.")
         self.interrupt()
 
     def leave(self, reason: str) -> None:
-        """Take note that nobody can be followed any more: at once, nothing is tracked.
+        """Note that the operator is gone: nothing is tracked from now on.
 
         Frames that come after it begin anew. The reason is `trouble` until they are read, however
         soon that is, so that the operator learns why the robot was let go.
@@ -261,12 +261,12 @@ class LiveDevice(Device):
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the stream now, in words; empty if nothing is."""
+        """Present fault of the stream in words; empty if none."""
         return self.status.trouble
 
     @property
     def status(self) -> StreamStatus:
-        """How the stream is doing now."""
+        """Present status of the stream."""
         with self._lock:
             now = self.clock()
             age = float("inf") if self._newest is None else now - self._newest.time

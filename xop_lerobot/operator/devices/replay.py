@@ -114,5 +114,5 @@ class ReplayDevice(Player):
         return self.recording.frame_at(stamp)
 
     def is_paused(self, time: float) -> bool:
-        """Whether the person of the recording had let go of their robot."""
+        """Whether the recorded person was disengaged."""
         return not self.recording.is_engaged_at(self.elapsed(time))

@@ -1,4 +1,4 @@
-"""Play a scripted person: waypoints, made human by minimum jerk, sway and tremor."""
+"""Play a scripted person: waypoints with minimum jerk, postural sway and tremor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEFAULT_SCRIPT = "g1_squat_walk_reach"
 
 
 class ScriptedDevice(Player):
-    """A person who does what a script says; the same seed gives the same stream.
+    """A person who follows a script; the same seed gives the same stream.
 
     Args:
         config: Its settings; without a `path` the script is `DEFAULT_SCRIPT`.
@@ -59,7 +59,7 @@ class ScriptedDevice(Player):
         return self.script.duration
 
     def frame_at(self, stamp: float) -> OperatorFrame:
-        """Frame at `stamp` [s] of the script's clock; a person goes on swaying at the end."""
+        """Frame at `stamp` [s] of the script's clock; the sway continues after its end."""
         script = self.script
         sway = self._noise.at(stamp)
         head = script.tracks["head"].at(stamp)

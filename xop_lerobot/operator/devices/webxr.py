@@ -35,11 +35,11 @@ FUTURE_S = 0.05
 
 
 class PortTaken(XopError):
-    """The port cannot be listened at; the message says why, and which flag chooses another."""
+    """The port cannot be opened; the message gives the reason and the flag that changes it."""
 
 
 class WebXrDevice(LiveDevice):
-    """A headset, or a stand-in for one, that opens our page and streams head and hands.
+    """A headset, or a stand-in, that opens our page and streams head and hands.
 
     Args:
         config: Its settings.
@@ -75,7 +75,7 @@ class WebXrDevice(LiveDevice):
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """Description of the page, for messages."""
         return f"WebXR page at {self.url}"
 
     @property
@@ -104,7 +104,7 @@ class WebXrDevice(LiveDevice):
         print(write_invitation(self.host, self.port, self.tls, self.code, fingerprint, qr))
 
     def disconnect(self) -> None:
-        """Dismiss everybody and close the port; may be called twice."""
+        """Close all connections and the port; may be called twice."""
         super().disconnect()
         self._pictures.stop()
         if self._listener is not None:
@@ -139,7 +139,7 @@ class WebXrDevice(LiveDevice):
 
     @property
     def status(self) -> StreamStatus:
-        """How the stream is doing now."""
+        """Present status of the stream."""
         status = super().status
         with self._lock:
             now = self.clock()
@@ -173,7 +173,7 @@ class WebXrDevice(LiveDevice):
                 self._loop.call_soon_threadsafe(self._loop_stop.set)
 
     def end_silence(self) -> None:
-        """Say so; the page stays connected, and its wearer may go on."""
+        """Report the silence; the page stays connected and may continue."""
         self._say(f"{self.address}: nothing has come for {SILENT_S:g} s")
 
     def take(self, message: FrameMessage, client: Client) -> None:
@@ -203,11 +203,11 @@ class WebXrDevice(LiveDevice):
             self.receive(message.frame, message.sent)
 
     def wish(self, wish: Wish) -> None:
-        """Take what the operator wants of the recording."""
+        """Receive a request of the operator to the recorder."""
         self._wishes.append(wish)
 
     def write_shown(self, role: str) -> list[str]:
-        """What is to be shown now, as messages."""
+        """Messages with the present display."""
         display, frame = self._display, self._read
         if display is None:
             return []

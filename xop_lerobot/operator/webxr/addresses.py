@@ -1,4 +1,4 @@
-"""By which names and addresses other machines reach this one."""
+"""Names and addresses of this machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OUTSIDE = "192.0.2.1:9"
 
 
 def list_addresses() -> list[str]:
-    """Addresses of this machine in its networks, that of the usual way out first.
+    """Addresses of this machine in its networks, that of the default route first.
 
     Addresses that hold for one cable alone (link-local) and loopback are left out.
     """
@@ -59,7 +59,7 @@ def make_url(scheme: str, host: str, port: int, code: str = "") -> str:
 
 
 def find_own_address(target: str) -> str:
-    """Our own IPv4 address on the way to `target` (host:port); nothing is sent."""
+    """Own IPv4 address on the route to `target` (host:port); nothing is sent."""
     host, _, port = target.rpartition(":")
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -92,7 +92,7 @@ def draw_qr(text: str) -> str:
 def write_invitation(
     host: str, port: int, tls: bool, code: str, fingerprint: str = "", qr: bool = True
 ) -> str:
-    """Write what to open where.
+    """Write the instructions to open the page.
 
     Args:
         host: Where the server listens.

@@ -1,4 +1,4 @@
-"""The certificate of this machine, made when it is first needed; browsers ask for one.
+"""Certificate of this machine, made on first use.
 
 It signs itself, is valid for the machine's own names and addresses alone, and never leaves the
 user's own folder but for its public half.
@@ -75,7 +75,7 @@ def find_folder() -> Path:
 
 
 def list_own_names() -> frozenset[str]:
-    """Everything that this machine is called now."""
+    """All present names and addresses of this machine."""
     return frozenset([*list_names(), *LOOPBACKS, *list_addresses()][:MAX_NAMES])
 
 
@@ -84,7 +84,7 @@ def get_certificate(
     names: Iterable[str] | None = None,
     now: datetime.datetime | None = None,
 ) -> Certificate:
-    """Return this machine's certificate; make it where there is none that will do.
+    """Return this machine's certificate; make one if none is valid.
 
     A new one is made when a name or an address is not in it, when it ends within 30 days, when
     it does not belong to its key, and when others could have read the key.

@@ -1,4 +1,4 @@
-"""One page that is connected: its clock, and what is sent to it."""
+"""One connected page: its clock, and messages to it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SLEPT_S = 0.05
 
 
 class Answer(NamedTuple):
-    """What one ping has told.
+    """Result of one ping.
 
     Attributes:
         time: When its answer came [s].
@@ -137,7 +137,7 @@ class Client:
         self._on_the_way = [number for number in self._on_the_way if number > pong.number]
 
     def measure_delay(self, message: FrameMessage, time: float) -> tuple[float, float] | None:
-        """How long ago a frame that comes at `time` [s] was sent.
+        """Delay of a frame that arrives at `time` [s].
 
         Returns:
             Delay, below 0 for frames of the future, and how far it may be off [s]; None while no
@@ -195,7 +195,7 @@ class Client:
 
 
 def _limit_buffer(transport: asyncio.Transport | None) -> None:
-    """Let the system hold back little, so that what is unsent can be seen here."""
+    """Limit the system's send buffer, so that unsent data is visible here."""
     connection = None if transport is None else transport.get_extra_info("socket")
     option = getattr(socket, "TCP_NOTSENT_LOWAT", None)
     if connection is not None and option is not None:

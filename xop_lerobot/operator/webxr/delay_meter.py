@@ -1,4 +1,4 @@
-"""How old the frames of a headset are when they arrive, and what to say about it."""
+"""Delay of a headset's frames, and its warnings."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class DelayMeter:
         return statistics.median(d for _, d, _ in self._frames) if self._frames else None
 
     def describe(self, time: float) -> str:
-        """What is wrong with the delay, in words; empty if nothing is."""
+        """Warning about the delay in words; empty if none."""
         delay = self.measure(time)
         if delay is None:
             return ""

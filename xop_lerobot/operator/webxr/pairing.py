@@ -1,4 +1,4 @@
-"""Who may come in: the code of a session, and how often somebody may guess it."""
+"""Access control: the code of a session, and limits on guessing it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def make_code() -> str:
 
 
 def check_code(code: str) -> None:
-    """Check a code that somebody has chosen.
+    """Check a code chosen by the user.
 
     Raises:
         BadValue: If it is short, or cannot stand in an address.
@@ -47,7 +47,7 @@ def check_code(code: str) -> None:
 
 
 class Door:
-    """Compares codes, and blocks addresses from which too many wrong ones come.
+    """Compares codes, and blocks addresses that send too many wrong ones.
 
     Args:
         code: The right one.
@@ -58,7 +58,7 @@ class Door:
         self._wrong: OrderedDict[str, tuple[int, float]] = OrderedDict()  # how many, when last
 
     def refuse(self, address: str, code: str, time: float) -> str | None:
-        """Why a client from `address` may not come in at `time` [s], None if it may."""
+        """Reason to refuse a client from `address` at `time` [s], None if it is admitted."""
         count, last = self._wrong.get(address, (0, time))
         wait = last + BLOCK_S - time
         if wait <= 0:
@@ -97,7 +97,7 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class Connections:
-    """Lets connections in, and ends those that hold a place for nothing.
+    """Accepts connections, and ends idle ones.
 
     Only those that are there, or may still arrive, are remembered: however many come and go, it
     is never more than `MAX_CONNECTIONS` of each.
@@ -153,7 +153,7 @@ class Connections:
 
 
 class _Refusal(asyncio.Protocol):
-    """Closes a connection for which there is no room."""
+    """Closes a connection beyond the limit."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         transport.close()

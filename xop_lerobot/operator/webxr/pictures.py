@@ -1,4 +1,4 @@
-"""Camera pictures as JPEG, encoded on a thread of their own; the newest wins."""
+"""Camera images as JPEG, encoded on a separate thread; the newest wins."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIRST = "head"
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What all cameras saw at one instant.
+    """Images of all cameras at one instant.
 
     Attributes:
         messages: A message for each camera: its number in one byte, then the JPEG.
@@ -33,7 +33,7 @@ class Picture:
 
 
 class PictureEncoder:
-    """Encodes the newest pictures that it was given; what it has no time for is skipped."""
+    """Encodes the newest images; older ones are skipped."""
 
     def __init__(self) -> None:
         self.newest: Picture | None = None
@@ -78,7 +78,7 @@ class PictureEncoder:
 
 
 def encode(pictures: Mapping[str, np.ndarray]) -> Picture:
-    """Encode what the cameras see, the head's first.
+    """Encode the images of the cameras, the head's first.
 
     Args:
         pictures: By camera. Shapes (height, width, 3), uint8.

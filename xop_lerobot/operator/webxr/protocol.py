@@ -1,4 +1,4 @@
-"""What the page and the server say to each other, and what its poses mean in our convention.
+"""Messages between page and server, and conversion of poses to our convention.
 
 Everything but pictures is JSON text. A page sends `frame`, `pong`, `wish` and `bye`; the server
 sends `welcome`, `ping`, `display`, `pose` and `refused`, and pictures as a byte with the number of
@@ -49,7 +49,7 @@ _NOWHERE = np.full(7, np.nan)
 
 @dataclass(frozen=True)
 class FrameMessage:
-    """Head and hands of the wearer.
+    """Head and hands of the operator.
 
     Attributes:
         number: Counts up, one page's frames.
@@ -79,7 +79,7 @@ class Pong:
 
 @dataclass(frozen=True)
 class Bye:
-    """The wearer has ended the session, or has taken the headset off.
+    """The operator has ended the session, or has taken the headset off.
 
     Attributes:
         reason: Why, in words.
@@ -92,7 +92,7 @@ Message = FrameMessage | Pong | Wish | Bye
 
 
 def parse_message(text: str) -> Message | str:
-    """Decode what a page has sent.
+    """Decode a page's message.
 
     Returns:
         The message; or why it is none, in one word.
@@ -127,7 +127,7 @@ def _parse_bye(values: Mapping[str, Any]) -> Bye:
 
 
 def clean(text: str) -> str:
-    """What of `text` may stand in a log: one line, printable, not too long."""
+    """`text` for a log: one line, printable, shortened."""
     return "".join(c if c.isprintable() else " " for c in text[:MAX_REASON]).strip()
 
 
@@ -219,7 +219,7 @@ def _read_count(value: Any) -> int | None:
 
 
 def write_welcome(role: str, robot: str, gestures: Mapping[str, str]) -> str:
-    """Write what somebody is told who has come in."""
+    """Write the welcome message to a new client."""
     return json.dumps(
         {
             "type": "welcome",
@@ -281,7 +281,7 @@ def write_display(
 
 
 def write_pose(frame: OperatorFrame) -> str:
-    """Write head and wrists for those who look on: x y z qw qx qy qz, null where not seen."""
+    """Write head and wrists for monitors: x y z qw qx qy qz, null where not tracked."""
     names = ("head", "left_wrist", "right_wrist")
     poses = [
         [round(float(x), 4) for x in frame.pose(name)] if seen else None

@@ -1,4 +1,4 @@
-"""The one port of a WebXR headset: its page, its certificate and its WebSocket."""
+"""Server of a WebXR headset: page, certificate and WebSocket on one port."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Wearer(Protocol):
         ...
 
     def wish(self, wish: Wish) -> None:
-        """Take what the operator wants of the recording."""
+        """Receive a request of the operator to the recorder."""
         ...
 
     def leave(self, reason: str) -> None:
@@ -90,7 +90,7 @@ class Wearer(Protocol):
         ...
 
     def write_shown(self, role: str) -> list[str]:
-        """What is to be shown now, as messages."""
+        """Messages with the present display."""
         ...
 
     def take_picture(self) -> Picture | None:
@@ -253,7 +253,7 @@ class HeadsetServer:
                 return
 
     def _take(self, client: Client, text: str) -> str | None:
-        """Take one message; return why the connection ends, None if it goes on."""
+        """Process one message; return the reason to disconnect, None to continue."""
         if client.rate.is_broken(asyncio.get_running_loop().time()):
             return "too many messages"
         if len(text.encode()) > MAX_MESSAGE:
@@ -293,7 +293,7 @@ class HeadsetServer:
 
 
 def _make_logger() -> logging.Logger:
-    """A log that does not grow with whatever somebody sends that is no HTTP."""
+    """A logger that ignores malformed HTTP."""
     own = logging.getLogger(f"{__name__}.http")
     own.addFilter(_is_our_fault)
     return own
@@ -304,7 +304,7 @@ def _is_our_fault(record: logging.LogRecord) -> bool:
 
 
 def _is_own_page(request: web.Request) -> bool:
-    """Whether it was no page of another site that opened the connection."""
+    """Whether the connection was not opened by a page of another site."""
     origin = request.headers.get("Origin")
     return origin is None or urlsplit(origin).netloc == request.host
 

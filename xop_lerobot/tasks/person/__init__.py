@@ -1,1 +1,1 @@
-"""A simulated person in the headset: sees late and not quite, moves as people move, corrects."""
+"""A simulated person in the headset: delayed, noisy perception, human motion, corrections."""

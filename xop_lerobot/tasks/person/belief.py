@@ -1,4 +1,4 @@
-"""How a person believes that the robot's world and the own room lie on each other."""
+"""Estimated transform between the robot's world and the person's room."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulated person who sees the robot and its task, and tries to accomplish it."""
+"""Device of a simulated person who sees the robot and performs its task."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""To take hold of a box between both palms, to lift it, and to let go of it."""
+"""Grasping: hold a box between both palms, lift it, release it."""
 
 from __future__ import annotations
 

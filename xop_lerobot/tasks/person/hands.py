@@ -1,4 +1,4 @@
-"""To stand so that the hands can reach, and to bring them to where one wants them."""
+"""Reaching: posture for the hands, and movements of the hands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sets out to do, by the name of the task."""
+"""Intentions of a person by the name of the task."""
 
 from __future__ import annotations
 

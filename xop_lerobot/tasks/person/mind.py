@@ -1,4 +1,4 @@
-"""The person: looks, decides, moves; one step of an intention in each tick."""
+"""The simulated person: looks, decides, moves; one step of an intention per tick."""
 
 from __future__ import annotations
 

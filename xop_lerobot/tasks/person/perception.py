@@ -1,4 +1,4 @@
-"""What a person sees of the robot's world: late, within the field of view, and not quite."""
+"""Perception of the robot's world: delayed, within the field of view, with errors."""
 
 from __future__ import annotations
 

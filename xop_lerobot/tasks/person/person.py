@@ -1,4 +1,4 @@
-"""What a person is like: every parameter of the simulated one, with its unit and its source."""
+"""Parameters of the simulated person, with units and sources."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Person:
 
 
 def draw_person(rng: np.random.Generator) -> Person:
-    """Draw one person: as tall and as quick as this one happens to be.
+    """Draw the parameters of one person.
 
     Args:
         rng: Source of the person.

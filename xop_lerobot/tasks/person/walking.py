@@ -1,4 +1,4 @@
-"""To find things, to go where one wants to stand, and to change the mode."""
+"""Searching, walking, and changing the mode."""
 
 from __future__ import annotations
 
