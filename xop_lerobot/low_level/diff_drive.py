@@ -39,8 +39,8 @@ def compute_wheel_speeds(v: np.ndarray, yaw_rate: np.ndarray) -> tuple[np.ndarra
 class DiffDrive(LowLevelPolicy):
     """Wheel speeds by the kinematics; torso, arms and grippers by their targets.
 
-    The servos are in the model: a torque proportional to the speed error at the wheels, stiff
-    position control without gravity compensation at the joints. Which target goes where is found by
+    The servos are in the model: a torque proportional to the speed error at the wheels,
+    position control and gravity compensation at the joints. Which target goes where is found by
     name: an actuator takes the command entry of its name, else the arm target of its name, else
     zero (the head looks straight ahead). Targets are clipped to the actuators' ranges.
 
