@@ -42,7 +42,7 @@ def make_parser() -> CommandParser:
     add("--task", help="dual_point_touch, box_pick_and_place or non_prehensile_transport")
     add("--methods", help="methods, comma-separated: mpc, mpc_no_sync, mpc_table1, direct, "
         "direct_amo (default: mpc,direct)")  # fmt: skip
-    add("--variant", help="variants of the methods, with commas between; each is a binding of the "
+    add("--variant", help="variants of the methods, comma-separated; each is a binding of the "
         "robot (v1, v2), upright and a preset (conservative, aggressive) with underscores "
         "between, as v2_upright (default: the robot's own)")  # fmt: skip
     add("--low-level", help="low-level policies, comma-separated: default, falcon, "
