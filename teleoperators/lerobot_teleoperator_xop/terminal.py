@@ -15,7 +15,7 @@ from lerobot.utils.keyboard_input import (
 )
 
 from xop_lerobot.control.client import HELP, Target, press
-from xop_lerobot.recording.host import RECORD_MODULE, ROLLOUT_MODULE, find
+from xop_lerobot.recording.lerobot_patches import RECORD_MODULE, ROLLOUT_MODULE, find
 
 logger = logging.getLogger(__name__)
 

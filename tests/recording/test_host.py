@@ -23,7 +23,7 @@ from toy_robot import SMALL, XopToyConfig, make_teleop, make_toy
 
 from tests.recording.test_dataset import STREAMING, tick
 from xop_lerobot.core.errors import BadValue, LinkError
-from xop_lerobot.recording import host, rollout_loop
+from xop_lerobot.recording import host, lerobot_patches
 from xop_lerobot.recording.dataset import DatasetExists, WrongFps, XopDataset
 from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.recording.record import build_features
@@ -246,8 +246,8 @@ def test_if_lerobot_has_moved_it_is_left_alone(
 
 
 def test_this_lerobot_has_no_fault():
-    assert host.find_fault([record_module, rollout_module]) == ""
-    assert rollout_loop.find_strategy() == (EpisodicStrategy, "")
+    assert lerobot_patches.find_fault([record_module, rollout_module]) == ""
+    assert lerobot_patches.find_strategy() == (EpisodicStrategy, "")
 
 
 # LeRobot after 0.6.1: the loops have a timer and no rate, and the timer complains of slow ticks.
@@ -370,7 +370,7 @@ def test_a_rollout_that_cannot_be_held_to_its_length_says_so(
 
 def test_lockstep_takes_no_actions_between_the_policys(session, recording):
     _, _, dataset = recording
-    loop = rollout_loop.count_in_frames(NextStrategy._policy_loop, session)
+    loop = host.count_in_frames(NextStrategy._policy_loop, session)
     strategy = types.SimpleNamespace(_interpolator=types.SimpleNamespace(multiplier=2))
     with pytest.raises(BadValue) as refusal:
         loop(

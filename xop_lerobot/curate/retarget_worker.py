@@ -18,7 +18,7 @@ from xop_lerobot.curate.retarget_job import DEVICE
 from xop_lerobot.operator.alignment import EngageRefused
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.devices.replay import ReplayDevice
-from xop_lerobot.recording.host import count_ticks
+from xop_lerobot.recording.lockstep import count_ticks
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,48 +12,29 @@ from __future__ import annotations
 import inspect
 import logging
 import math
-import sys
 import threading
 from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from xop_lerobot.core.errors import LinkError
+from xop_lerobot.core.errors import BadValue, LinkError
 from xop_lerobot.core.shutdown import TermAsInterrupt
+from xop_lerobot.recording.lerobot_patches import (
+    LOOP,
+    RECORD_MODULE,
+    ROLLOUT_MODULE,
+    find,
+    find_fault,
+    find_strategy,
+    get_loop_signature,
+)
 from xop_lerobot.recording.lockstep import count_ticks, without_slowness
 from xop_lerobot.session import get_session
 
 if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDataset
-
     from xop_lerobot.recording.dataset import XopDataset
 
 logger = logging.getLogger(__name__)
-
-RECORD_MODULE = "lerobot.scripts.lerobot_record"
-ROLLOUT_MODULE = "lerobot.rollout.context"
-
-_DATASET_SIGNATURES = {
-    "create": ("repo_id", "fps", "features", "root"),
-    "resume": ("repo_id", "root"),
-    "add_frame": ("self", "frame"),
-    "save_episode": ("self", "episode_data", "parallel_encoding"),
-    "clear_episode_buffer": ("self", "delete_images"),
-    "finalize": ("self",),
-}
-"""First parameters of the dataset's methods that `XopDataset` overrides."""
-_META_SIGNATURES = {
-    "save_episode": (
-        "self",
-        "episode_index",
-        "episode_length",
-        "episode_tasks",
-        "episode_stats",
-        "episode_metadata",
-    ),
-}
-_LOOP_PARAMETERS = ("robot", "events", "dataset", "teleop", "control_time_s")
-"""Parameters of `record_loop` that the replacement reads or changes."""
 
 
 class Host:
@@ -103,11 +84,9 @@ class Host:
 
     def _hold_policies_to_length(self) -> None:
         """Let `lerobot-rollout`, if it runs, count frames too, where its loop is as expected."""
-        from xop_lerobot.recording import rollout_loop  # noqa: PLC0415  brings torch
-
         if find(ROLLOUT_MODULE) is None:
             return
-        strategy, fault = rollout_loop.find_strategy()
+        strategy, fault = find_strategy()
         if strategy is None:
             logger.warning(
                 "LeRobot has changed (%s), so a lock-step episode of lerobot-rollout ends by the "
@@ -115,10 +94,10 @@ class Host:
                 fault,
             )
             return
-        loop = getattr(strategy, rollout_loop.LOOP)
+        loop = getattr(strategy, LOOP)
         stock = getattr(loop, "xop_stock", loop)
-        ours = rollout_loop.count_in_frames(stock, self._session)
-        self._replace(strategy, rollout_loop.LOOP, ours)
+        ours = count_in_frames(stock, self._session)
+        self._replace(strategy, LOOP, ours)
 
     def remove(self) -> None:
         """Put LeRobot's own names back; may be called twice."""
@@ -174,52 +153,46 @@ class Host:
             return False
 
 
-def find(name: str) -> ModuleType | None:
-    """Return LeRobot's module `name` if it is loaded, also when it is the program itself."""
-    main = sys.modules.get("__main__")
-    if main is not None and getattr(getattr(main, "__spec__", None), "name", None) == name:
-        return main
-    return sys.modules.get(name)
+def count_in_frames(stock: Callable[..., None], session: str) -> Callable[..., None]:
+    """Make LeRobot's loop of one episode end by its number of frames, for a lock-step robot.
+
+    Args:
+        stock: `EpisodicStrategy._policy_loop`.
+        session: Session whose robot is driven.
+    """
+    signature = inspect.signature(stock)
+
+    def policy_loop(*args: Any, **kwargs: Any) -> None:
+        """Run LeRobot's loop; the episode's time passes on the robot's clock."""
+        from xop_lerobot.recording.dataset import XopDataset  # noqa: PLC0415  brings torch
+
+        call = signature.bind(*args, **kwargs).arguments
+        dataset = call["dataset"]
+        if not isinstance(dataset, XopDataset) or dataset.session_name != session:
+            stock(**call)
+            return
+        if get_session(session).robot.realtime:
+            dataset.begin(call["events"], None)
+            stock(**call)
+            return
+        _check_multiplier(call["self"], dataset.fps)
+        dataset.begin(call["events"], count_ticks(call["control_time_s"], dataset.fps))
+        call["control_time_s"] = math.inf
+        with without_slowness():
+            stock(**call)
+
+    return policy_loop
 
 
-def get_loop_signature(loop: Callable[..., None]) -> inspect.Signature:
-    """Return the signature of LeRobot's loop, which a decorator hides in a closure."""
-    inner = getattr(loop, "xop_stock", loop)
-    inner = inspect.getclosurevars(inner).nonlocals.get("func", inner)
-    return inspect.signature(inner)
+def _check_multiplier(strategy: object, fps: int) -> None:
+    """Check that each action of the policy is sent once.
 
-
-def find_fault(modules: list[ModuleType]) -> str:
-    """Say what in LeRobot is not as this module expects it; empty if all is."""
-    for module in modules:
-        dataset: type[LeRobotDataset] | None = getattr(module, "LeRobotDataset", None)
-        if dataset is None:
-            return f"{module.__name__} has no LeRobotDataset"
-        fault = _compare(dataset, _DATASET_SIGNATURES)
-        if not fault and find(RECORD_MODULE) is module:
-            fault = _find_loop_fault(module)
-        if fault:
-            return fault
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata  # noqa: PLC0415
-
-    return _compare(LeRobotDatasetMetadata, _META_SIGNATURES)
-
-
-def _compare(owner: type, expected: dict[str, tuple[str, ...]]) -> str:
-    for name, parameters in expected.items():
-        method = getattr(owner, name, None)
-        if method is None:
-            return f"{owner.__name__} has no {name}()"
-        actual = tuple(inspect.signature(method).parameters)
-        if actual[: len(parameters)] != parameters:
-            return f"{owner.__name__}.{name}() takes {', '.join(actual)}"
-    return ""
-
-
-def _find_loop_fault(module: ModuleType) -> str:
-    loop = getattr(module, "record_loop", None)
-    if loop is None:
-        return f"{module.__name__} has no record_loop()"
-    actual = get_loop_signature(loop).parameters
-    missing = [name for name in _LOOP_PARAMETERS if name not in actual]
-    return f"record_loop() has no parameter {', '.join(missing)}" if missing else ""
+    Raises:
+        BadValue: If LeRobot sends actions between them: each moves a lock-step robot by a tick.
+    """
+    multiplier = getattr(getattr(strategy, "_interpolator", None), "multiplier", 1)
+    if multiplier != 1:
+        raise BadValue(
+            f"--interpolation_multiplier must be 1 with a robot in lock-step, got {multiplier}: "
+            f"each action that is sent takes 1/{fps} s. Use --robot.clock=realtime for more"
+        )

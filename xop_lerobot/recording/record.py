@@ -49,7 +49,7 @@ from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm
 from xop_lerobot.morphology.morphology import list_robot_types
 from xop_lerobot.recording.dataset import XopDataset
-from xop_lerobot.recording.host import count_ticks
+from xop_lerobot.recording.lockstep import count_ticks
 from xop_lerobot.recording.resume import check_storage
 from xop_lerobot.recording.tick import run_tick
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from xop_lerobot.core.command_line import report_mistakes
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.recording.host import find
+from xop_lerobot.recording.lerobot_patches import find
 
 if TYPE_CHECKING:
     from lerobot_robot_xop.config_xop import XopRobotConfig
