@@ -15,7 +15,7 @@ from lerobot.utils.keyboard_input import (
 )
 
 from xop_lerobot.control.client import HELP, Target, press
-from xop_lerobot.recording.lerobot_patches import RECORD_MODULE, ROLLOUT_MODULE, find
+from xop_lerobot.recording.lerobot_patches import CONTEXT_MODULE, RECORD_MODULE, runs
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ def listen_to_terminal(target: Target) -> TerminalKeyListener | None:
     Without a display LeRobot's record and rollout commands read the terminal themselves, and
     two readers would take each other's keys. `xop-record` shares its reader instead.
     """
-    taken = not pynput_can_capture() and (find(RECORD_MODULE) or find(ROLLOUT_MODULE))
+    taken = not pynput_can_capture() and (runs(RECORD_MODULE) or runs(CONTEXT_MODULE))
     if taken or not sys.stdin.isatty():
         reason = "LeRobot reads this terminal" if taken else "this is no terminal"
         logger.warning("--teleop.keys: %s; use xop-record, or --teleop.control.", reason)

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from contextlib import nullcontext
+from importlib.metadata import version
 from pathlib import Path
 from queue import Queue
 from types import SimpleNamespace
@@ -41,6 +42,7 @@ from xop_lerobot.recording.dataset import (
 )
 from xop_lerobot.recording.executed import put_executed
 from xop_lerobot.recording.facts import compute_config_hash, read_facts
+from xop_lerobot.recording.lerobot_patches import ROTATION, LeRobotMisfit
 from xop_lerobot.recording.record import build_features
 from xop_lerobot.recording.writer import MAX_IMAGES, VideoQueue
 from xop_lerobot.session import Executed, Outcome, TickRecord, get_session
@@ -537,10 +539,21 @@ def test_dropped_frames_are_counted():
     assert VideoQueue(None).dropped == 0
 
 
-def test_an_encoder_that_changed_is_reported(caplog):
-    queue = VideoQueue(object())
-    assert "frames that it drops can be neither prevented nor counted" in caplog.text
-    queue.wait()
+def test_an_encoder_that_cannot_be_waited_for_is_refused(session, pair, tmp_path, monkeypatch):
+    """Its pictures would belong to other rows; image files need no such encoder."""
+    encoder = type("Encoder", (), {"_frame_queues": None, "_threads": None})
+    monkeypatch.setattr("lerobot.datasets.video_utils.StreamingVideoEncoder", encoder)
+    with pytest.raises(LeRobotMisfit) as refusal:
+        create(session, pair[0], tmp_path / "data", **STREAMING)
+    assert str(refusal.value) == (
+        f"LeRobot {version('lerobot')} does not fit the patch 'queues of the video encoder', made "
+        "for 0.6.1: lerobot.datasets.video_utils.StreamingVideoEncoder must have _frame_queues, "
+        "_threads, _dropped_frames, and has no _dropped_frames. Frames of a video could be lost "
+        "without a sign, and its pictures then belong to other rows. Use "
+        "--dataset.streaming_encoding=false."
+    )
+    assert not (tmp_path / "data").exists()
+    create(session, pair[0], tmp_path / "data").finalize()
 
 
 @pytest.mark.slow
@@ -583,13 +596,20 @@ def test_an_episode_with_lost_frames_is_marked_in_real_time(session, pair, tmp_p
 # Durability.
 
 
+NO_ROTATION = dataclasses.replace(
+    ROTATION, expects={"lerobot.datasets.dataset_writer:DatasetWriter": ("_gone",)}
+)
+"""A LeRobot without the private names that `ROTATION` needs."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rotates", [True, False])
 def test_saved_episodes_load_while_the_session_goes_on(
     session, pair, tmp_path, monkeypatch, rotates
 ):
     """The files on disk are whole after each save, also when LeRobot's private names are gone."""
-    monkeypatch.setattr(writer, "can_rotate", lambda dataset: rotates)
+    if not rotates:
+        monkeypatch.setattr("xop_lerobot.recording.dataset.ROTATION", NO_ROTATION)
     robot, teleop = pair
     dataset = create(session, robot, tmp_path / "data", **STREAMING)
     for saved in range(1, 4):
@@ -603,10 +623,6 @@ def test_saved_episodes_load_while_the_session_goes_on(
     # The recording object itself reads on afterwards.
     assert get_row(dataset, 8)["goal.head"].shape == (7,)
     assert len(read_facts(dataset.root)) == 3
-
-
-def test_can_rotate_this_lerobot(session, pair, tmp_path):
-    assert writer.can_rotate(create(session, pair[0], tmp_path / "data"))
 
 
 def test_signals_wait_for_the_save():

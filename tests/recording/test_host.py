@@ -6,8 +6,11 @@ import gc
 import logging
 import math
 import signal
+import sys
 import types
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +18,6 @@ from foreign_robot import ForeignRobot, ForeignRobotConfig, ForeignTeleopConfig
 from lerobot.configs.dataset import DatasetRecordConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.rollout import context as rollout_module
-from lerobot.rollout.strategies.episodic import EpisodicStrategy
 from lerobot.scripts import lerobot_record as record_module
 from lerobot.utils.keyboard_input import apply_recording_control
 from lerobot_rows import get_row
@@ -26,6 +28,7 @@ from xop_lerobot.core.errors import BadValue, LinkError
 from xop_lerobot.recording import host, lerobot_patches
 from xop_lerobot.recording.dataset import DatasetExists, WrongFps, XopDataset
 from xop_lerobot.recording.facts import read_facts
+from xop_lerobot.recording.lerobot_patches import LeRobotMisfit
 from xop_lerobot.recording.record import build_features
 
 STOCK_DATASET, STOCK_LOOP = LeRobotDataset, record_module.record_loop
@@ -38,6 +41,7 @@ def session(request) -> str:
 
 @pytest.fixture(autouse=True)
 def leave_lerobot_as_it_was():
+    lerobot_patches._said.clear()
     yield
     gc.collect()
     assert record_module.LeRobotDataset is STOCK_DATASET
@@ -223,31 +227,72 @@ def moved_loop(robot, events, fps, dataset=None, teleop=None):
     ("owner", "name", "moved", "fault"),
     [
         (
-            LeRobotDataset,
-            "create",
-            classmethod(moved_create),
-            "LeRobotDataset.create() takes name, fps, features, root",
+            record_module,
+            "record_loop",
+            moved_loop,
+            "the patch 'loop of lerobot-record', made for 0.6.1: "
+            "lerobot.scripts.lerobot_record.record_loop() must take robot, events, dataset, "
+            "control_time_s, and takes robot, events, fps, dataset, teleop. In lerobot-record an "
+            "episode in lock-step would end by the wall clock, and gestures would not end any. Use "
+            "xop-record, which takes the same flags.",
         ),
-        (record_module, "record_loop", moved_loop, "record_loop() has no parameter control_time_s"),
-        (record_module, "LeRobotDataset", None, "lerobot.scripts.lerobot_record has no"),
+        (
+            record_module,
+            "LeRobotDataset",
+            None,
+            "the patch 'dataset of lerobot-record', made for 0.6.1: "
+            "lerobot.scripts.lerobot_record.LeRobotDataset is expected, and "
+            "lerobot.scripts.lerobot_record has no LeRobotDataset. lerobot-record cannot record "
+            "the operator's columns. Use xop-record, which takes the same flags.",
+        ),
     ],
 )
-def test_if_lerobot_has_moved_it_is_left_alone(
-    session, monkeypatch, caplog, owner, name, moved, fault
+def test_if_lerobot_has_moved_lerobot_record_is_refused(
+    session, monkeypatch, owner, name, moved, fault
 ):
+    """And LeRobot is left as it is, while programs with a loop of their own go on."""
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, moved)
         before = (record_module.LeRobotDataset, record_module.record_loop)
-        teleop = make_teleop(session)
+        with pytest.raises(LeRobotMisfit) as refusal:
+            make_teleop(session)
+        assert str(refusal.value) == f"LeRobot {version('lerobot')} does not fit {fault}"
         assert (record_module.LeRobotDataset, record_module.record_loop) == before
-        assert f"LeRobot has changed ({fault}" in caplog.text
-        assert "recorded WITHOUT the operator's columns" in caplog.text
+        with host.own_loop():
+            teleop = make_teleop(session)
+        assert (record_module.LeRobotDataset, record_module.record_loop) == before
         teleop.disconnect()
 
 
-def test_this_lerobot_has_no_fault():
-    assert lerobot_patches.find_fault([record_module, rollout_module]) == ""
-    assert lerobot_patches.find_strategy() == (EpisodicStrategy, "")
+def test_no_dataset_is_made_of_a_lerobot_that_has_moved(session, tmp_path, monkeypatch):
+    monkeypatch.setattr(LeRobotDataset, "create", classmethod(moved_create))
+    robot = make_toy(session)
+    with pytest.raises(LeRobotMisfit) as refusal:
+        XopDataset.bind(session).create("local/toy", 25, {}, root=tmp_path / "data")
+    assert str(refusal.value) == (
+        f"LeRobot {version('lerobot')} does not fit the patch 'subclass of LeRobotDataset', made "
+        "for 0.6.1: lerobot.datasets.LeRobotDataset.create() must take repo_id, fps, features, "
+        "root, and takes name, fps, features, root. Nothing can be recorded. Install LeRobot "
+        "0.6.1, or a newer xop-lerobot."
+    )
+    robot.disconnect()
+
+
+@pytest.mark.parametrize("module", ["lerobot.scripts.lerobot_record", "lerobot.rollout.context"])
+def test_a_command_whose_module_has_moved_is_noticed(session, monkeypatch, caplog, module):
+    """The program's name tells that it runs."""
+    command = "lerobot-record" if "record" in module else "lerobot-rollout"
+    other = {"lerobot-record": "lerobot.rollout.context"}.get(command, record_module.__name__)
+    with monkeypatch.context() as patch:
+        patch.delitem(sys.modules, other)
+        patch.setitem(sys.modules, module, None)
+        patch.setattr(sys, "argv", [f"/usr/bin/{command}"])
+        if command == "lerobot-record":
+            with pytest.raises(LeRobotMisfit, match="import of lerobot.scripts.lerobot_record"):
+                make_teleop(session)
+        else:
+            make_teleop(session).disconnect()
+            assert "import of lerobot.rollout.context halted" in caplog.text
 
 
 # LeRobot after 0.6.1: the loops have a timer and no rate, and the timer complains of slow ticks.
@@ -262,6 +307,9 @@ class NextStrategy:
     """LeRobot's next `EpisodicStrategy`; `timer` runs the loop with `driver` as the policy."""
 
     driver = None
+
+    def __init__(self) -> None:
+        self._interpolator = None
 
     def _policy_loop(
         self, ctx, robot, events, features, timer, control_time_s, dataset, single_task
@@ -333,14 +381,47 @@ def test_the_next_rollouts_end_by_frames(session, recording, monkeypatch, caplog
     assert NextStrategy._policy_loop is stock
     assert [row["length"] for row in read_facts(dataset.root)] == [5]
     assert "slower" not in caplog.text
-    assert "LeRobot has changed" not in caplog.text
+    assert "does not fit" not in caplog.text
+
+
+def hide(func):
+    """LeRobot's `safe_stop_image_writer`, under which a loop has no signature of its own."""
+
+    def wrapper(*args, **kwargs):
+        return func(*args, **kwargs)
+
+    return wrapper
+
+
+def test_the_next_lerobot_record_is_patched(recording, monkeypatch, caplog):
+    """From its own module, and put back."""
+    robot, teleop, dataset = recording
+    teleop.host.remove()
+    stock = hide(next_record_loop)
+    with monkeypatch.context() as patch:
+        patch.setattr(record_module, "record_loop", stock)
+        teleop.host.install()
+        assert record_module.record_loop is not stock
+        next_module: Any = record_module
+        next_module.record_loop(
+            robot=robot, events=make_events(), timer=NextTimer(), dataset=dataset, teleop=teleop,
+            control_time_s=0.2,
+        )  # fmt: skip
+        dataset.save_episode()
+        teleop.host.remove()
+        assert record_module.record_loop is stock
+    assert [row["length"] for row in read_facts(dataset.root)] == [5]
+    assert "slower" not in caplog.text
+    assert "does not fit" not in caplog.text
 
 
 class NoLoop:
-    pass
+    _interpolator = None
 
 
 class OtherLoop:
+    _interpolator = None
+
     def _policy_loop(self, events, dataset, seconds):
         pass
 
@@ -348,9 +429,23 @@ class OtherLoop:
 @pytest.mark.parametrize(
     ("strategy", "fault"),
     [
-        (None, "lerobot.rollout.strategies.episodic has no EpisodicStrategy"),
-        (NoLoop, "EpisodicStrategy has no _policy_loop()"),
-        (OtherLoop, "EpisodicStrategy._policy_loop() has no parameter control_time_s"),
+        (
+            None,
+            "EpisodicStrategy._policy_loop() is expected, and "
+            "lerobot.rollout.strategies.episodic has no EpisodicStrategy; "
+            "lerobot.rollout.strategies.episodic.EpisodicStrategy is expected, and "
+            "lerobot.rollout.strategies.episodic has no EpisodicStrategy",
+        ),
+        (
+            NoLoop,
+            "EpisodicStrategy._policy_loop() is expected, and "
+            "lerobot.rollout.strategies.episodic.EpisodicStrategy has no _policy_loop",
+        ),
+        (
+            OtherLoop,
+            "EpisodicStrategy._policy_loop() must take events, dataset, control_time_s, and takes "
+            "events, dataset, seconds",
+        ),
     ],
 )
 def test_a_rollout_that_cannot_be_held_to_its_length_says_so(
@@ -362,10 +457,11 @@ def test_a_rollout_that_cannot_be_held_to_its_length_says_so(
         # The columns are recorded all the same.
         assert issubclass(rollout_module.LeRobotDataset, XopDataset)
         teleop.disconnect()
-    assert (
-        f"LeRobot has changed ({fault}), so a lock-step episode of lerobot-rollout ends by the "
-        "wall clock." in caplog.text
-    )
+    assert caplog.messages == [
+        f"LeRobot {version('lerobot')} does not fit the patch 'loop of lerobot-rollout', made for "
+        f"0.6.1: lerobot.rollout.strategies.episodic.{fault}. In lerobot-rollout an episode in "
+        "lock-step ends by the wall clock: its length depends on the machine."
+    ]
 
 
 def test_lockstep_takes_no_actions_between_the_policys(session, recording):

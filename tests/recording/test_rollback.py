@@ -18,6 +18,7 @@ from lerobot.datasets.video_utils import StreamingVideoEncoder
 from lerobot_rows import get_row
 from toy_robot import make_toy
 
+from tests.recording import test_dataset
 from tests.recording.test_dataset import REPO, STREAMING, create, pair, session, tick  # noqa: F401  fixtures
 from xop_lerobot.recording import dataset as xop_dataset
 from xop_lerobot.recording.dataset import NotMade, XopDataset
@@ -79,7 +80,8 @@ POINTS = {
 def test_a_full_disk_costs_one_episode(
     session, pair, tmp_path, monkeypatch, point, rotates  # noqa: F811
 ):  # fmt: skip
-    monkeypatch.setattr("xop_lerobot.recording.writer.can_rotate", lambda _: rotates)
+    if not rotates:
+        monkeypatch.setattr(xop_dataset, "ROTATION", test_dataset.NO_ROTATION)
     root = tmp_path / "data"
     dataset = create(session, pair[0], root, **STREAMING)
     for _ in range(2):

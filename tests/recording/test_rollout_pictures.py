@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from toy_robot import XopToyConfig
 
 from lerobot_robot_xop import XopRobotConfig
 from xop_lerobot.core.errors import BadValue
+from xop_lerobot.recording import lerobot_patches
 from xop_lerobot.recording.rollout_pictures import watch_rollouts
 
 EVENT = Event()
@@ -93,10 +95,21 @@ def test_it_is_wrapped_once(built):
     assert lerobot_rollout.build_rollout_context is first
 
 
+def test_it_is_put_back(built):
+    stock = lerobot_rollout.build_rollout_context
+    patched = watch_rollouts(XopRobotConfig)
+    assert lerobot_rollout.build_rollout_context is not stock
+    patched.undo()
+    assert lerobot_rollout.build_rollout_context is stock
+
+
 def test_a_lerobot_that_has_changed_is_said(monkeypatch, caplog):
     monkeypatch.delattr(lerobot_rollout, "build_rollout_context")
+    monkeypatch.setattr(lerobot_patches, "_said", set())
     watch_rollouts(XopRobotConfig)
     assert caplog.messages == [
-        "LeRobot has changed (lerobot.scripts.lerobot_rollout has no build_rollout_context), so "
-        "nobody compares a policy's pictures with the robot's."
+        f"LeRobot {version('lerobot')} does not fit the patch 'set-up of lerobot-rollout', made "
+        "for 0.6.1: lerobot.scripts.lerobot_rollout.build_rollout_context() is expected, and "
+        "lerobot.scripts.lerobot_rollout has no build_rollout_context. Nobody compares the size of "
+        "a policy's pictures with the robot's: compare --robot.width and --robot.height yourself."
     ]

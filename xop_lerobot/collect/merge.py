@@ -5,21 +5,20 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from lerobot.datasets import aggregate, dataset_metadata
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.utils import EPISODES_DIR
 
 from xop_lerobot.collect.folder import CollectFolder
 from xop_lerobot.core.folders import write_whole
 from xop_lerobot.recording.facts import CONFIG_FILE, EPISODES_FILE, FACTS_DIR, read_facts
+from xop_lerobot.recording.lerobot_patches import MERGE_BARS, MERGE_EPISODES, replaced
 
 
 def merge_attempts(
@@ -51,8 +50,8 @@ def merge_attempts(
     merged = folder.merged
     shutil.rmtree(merged, ignore_errors=True)
     with (
-        _replaced(dataset_metadata, "load_episodes", _load_episodes),
-        _replaced(aggregate, "tqdm", SimpleNamespace(tqdm=_show_nothing)),
+        replaced(MERGE_EPISODES, _load_episodes),
+        replaced(MERGE_BARS, SimpleNamespace(tqdm=_show_nothing)),
     ):
         aggregate_datasets(
             [repo_id] * len(sources),
@@ -77,20 +76,6 @@ def _merge_facts(sources: Sequence[Path], merged: Path) -> None:
     with (merged / EPISODES_FILE).open("w", encoding="utf-8") as file:
         for index, row in enumerate(rows):
             file.write(json.dumps({**row, "episode_index": index}) + "\n")
-
-
-@contextmanager
-def _replaced(module: ModuleType, name: str, ours: Any) -> Iterator[None]:
-    """In the block, give LeRobot's module another `name`; nothing where it has none."""
-    if not hasattr(module, name):
-        yield
-        return
-    stock = getattr(module, name)
-    setattr(module, name, ours)
-    try:
-        yield
-    finally:
-        setattr(module, name, stock)
 
 
 def _show_nothing(things: Iterable[Any], **options: Any) -> Iterable[Any]:

@@ -22,6 +22,7 @@ from xop_lerobot.collect.config import CollectConfig, import_plugins
 from xop_lerobot.collect.folder import DATASET, Attempt
 from xop_lerobot.collect.run import get_index
 from xop_lerobot.recording.dataset import XopDataset
+from xop_lerobot.recording.host import own_loop
 from xop_lerobot.recording.lockstep import count_ticks
 from xop_lerobot.recording.record import build_features
 from xop_lerobot.recording.tick import run_tick
@@ -65,9 +66,8 @@ class Collector:
         """
         cpu = time.process_time()
         index = get_index(job)
-        teleop: Xop = make_device_from_device_class(self.config.make_teleop_config())
-        # LeRobot's own loop is not used here, so it needs no help.
-        teleop.host.remove()
+        with own_loop():
+            teleop: Xop = make_device_from_device_class(self.config.make_teleop_config())
         teleop.connect()
         try:
             dataset = self._create(folder / DATASET)

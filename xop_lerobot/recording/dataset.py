@@ -8,11 +8,12 @@ and teleoperator meet (`xop_lerobot.session`), so the loops need not know of it.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 import logging
 import shutil
 import time
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -38,6 +39,16 @@ from xop_lerobot.recording.facts import (
     compute_config_hash,
     keep_config,
     to_plain,
+)
+from xop_lerobot.recording.lerobot_patches import (
+    DATASET,
+    ENCODER,
+    EPISODE_METADATA,
+    ROLLBACK,
+    ROTATION,
+    Patched,
+    fits,
+    get_stock,
 )
 from xop_lerobot.recording.requests import Tally, grant
 from xop_lerobot.recording.resume import check_resumable
@@ -132,12 +143,14 @@ class XopDataset(LeRobotDataset):
 
         Raises:
             LinkError: If the session has no robot, or more than one.
+            LeRobotMisfit: If LeRobot has changed so that an episode would lack something.
             WrongFps: If the robot runs at another rate.
             BatchedEncoding: If videos should be encoded later than their episodes are saved.
             DatasetExists: If the directory is there already.
             NotMade: If the system does not let it be made.
         """
         info = get_session(cls.session_name).robot
+        fits(DATASET)
         _check_encoding(options)
         if fps != info.fps:
             raise WrongFps(info.fps, fps)
@@ -167,6 +180,7 @@ class XopDataset(LeRobotDataset):
 
         Raises:
             LinkError: If the session has no robot, or more than one.
+            LeRobotMisfit: If LeRobot has changed so that an episode would lack something.
             BatchedEncoding: If videos should be encoded later than their episodes are saved.
             BadDataset: If there is no dataset, or it cannot be read.
             NotResumable: If it is of another robot, or of other cameras or sizes of pictures.
@@ -174,6 +188,7 @@ class XopDataset(LeRobotDataset):
             BadValue: If its columns are those of another version.
         """
         info = get_session(cls.session_name).robot
+        fits(DATASET)
         _check_encoding(options)
         dataset = cls._open(repo_id, root, options)
         try:
@@ -244,24 +259,28 @@ class XopDataset(LeRobotDataset):
 
     def _attach_writer(self) -> None:
         self._video = VideoQueue(getattr(self.writer, "_streaming_encoder", None), self.writer)
-        stock = self.meta.save_episode
+        fits(ROLLBACK)  # a warning that comes before the disk is full
+        self._patched = Patched()
+        if fits(EPISODE_METADATA):
+            stock = get_stock(EPISODE_METADATA, self.meta)
+            # On the instance, so that other datasets of the process are untouched.
+            self._patched.put(EPISODE_METADATA, self._add_facts(stock), self.meta)
 
-        def save_with_facts(
-            episode_index: int,
-            episode_length: int,
-            episode_tasks: list[str],
-            episode_stats: dict[str, dict],
-            episode_metadata: dict,
-        ) -> None:
+    def _add_facts(self, stock: Callable[..., None]) -> Callable[..., None]:
+        signature = inspect.signature(stock)
+
+        def save_with_facts(*args: Any, **kwargs: Any) -> None:
             """Save an episode's metadata, with what is known of it as a whole."""
+            call = signature.bind(*args, **kwargs)
             if self._keep_facts:
-                episode_metadata = {**episode_metadata, **self._collect_facts().to_metadata()}
+                metadata = {**call.arguments["episode_metadata"]}
+                metadata |= self._collect_facts().to_metadata()
                 for key, value in self.more_facts.items():
-                    episode_metadata[FACTS_PREFIX + key] = json.dumps(value)
-            stock(episode_index, episode_length, episode_tasks, episode_stats, episode_metadata)
+                    metadata[FACTS_PREFIX + key] = json.dumps(value)
+                call.arguments["episode_metadata"] = metadata
+            stock(*call.args, **call.kwargs)
 
-        # An instance attribute, so that other datasets of the process are untouched.
-        self.meta.save_episode = save_with_facts
+        return save_with_facts
 
     def __bool__(self) -> bool:
         """True even while it is empty: `lerobot-record` finalizes its dataset `if dataset`."""
@@ -473,6 +492,7 @@ class XopDataset(LeRobotDataset):
         if self._is_finalized:
             return
         super().finalize()
+        self._patched.undo()
         self._session.progress = None
         if self._session.recorder is self:
             self._session.recorder = None
@@ -486,15 +506,16 @@ class XopDataset(LeRobotDataset):
         self._session.begin_episode(index)
 
     def _secure(self) -> None:
-        if writer.can_rotate(self):
+        """Close the files of the episode that was saved; the next one opens others."""
+        if fits(ROTATION):
             writer.rotate_writers(self)
             return
-        kept = {name: value for name, value in vars(self).items() if name in _KEPT}
+        self._patched.undo()
         LeRobotDataset.finalize(self)
-        names = LeRobotDataset.resume.__func__.__code__.co_varnames  # type: ignore[attr-defined]
-        options = {key: value for key, value in self._create_options.items() if key in names}
+        known = inspect.signature(LeRobotDataset.resume).parameters
+        options = {key: value for key, value in self._create_options.items() if key in known}
         fresh = super().resume(self.repo_id, root=self.root, **options)
-        self.__dict__.update(vars(fresh) | kept)
+        self.__dict__.update(vars(fresh))  # LeRobot's attributes alone
         # `fresh` shares the writer now; it must not close it when it is collected.
         fresh.writer = None
         self._attach_writer()
@@ -524,34 +545,18 @@ class XopDataset(LeRobotDataset):
 
 
 def _check_encoding(options: Mapping[str, Any]) -> None:
-    """Refuse LeRobot's batches of videos, which are encoded after their episodes are saved.
+    """Refuse encoding that may lose pictures.
 
-    Each episode has files of its own here, closed when it is saved; a batch would look for the
-    rows of all its episodes in one of them, and a killed process would lose its pictures.
+    LeRobot encodes batches of videos after their episodes are saved. Each episode has files of its
+    own here, closed when it is saved; a batch would look for the rows of all its episodes in one of
+    them, and a killed process would lose its pictures.
 
     Raises:
         BatchedEncoding: If a batch is larger than one episode.
+        LeRobotMisfit: If LeRobot's streaming encoder cannot be waited for.
     """
     size = options.get("batch_encoding_size", 1)
     if size > 1:
         raise BatchedEncoding(size)
-
-
-_KEPT = (
-    "_session",
-    "_info",
-    "_columns",
-    "_create_options",
-    "_keep_facts",
-    "_own_root",
-    "_tally",
-    "_tick_limit",
-    "_stop_on_success",
-    "_paused",
-    "_events",
-    "_last_state",
-    "_config",
-    "_config_hash",
-    "more_facts",
-)
-"""Attributes that outlive a change of writer."""
+    if options.get("streaming_encoding"):
+        fits(ENCODER)

@@ -4,29 +4,33 @@ LeRobot offers no way to add columns, or a hook for the episodes' boundaries, fr
 line. While an xop teleoperator exists, this module therefore puts two names of LeRobot's modules
 in the place of LeRobot's own: the dataset class, and in `lerobot-record` the loop of one episode,
 which is LeRobot's with another clock. Robots and teleoperators of others are passed through
-unchanged. If LeRobot's signatures have moved, nothing is replaced, and a warning says so.
+unchanged. What it expects of LeRobot is in `xop_lerobot.recording.lerobot_patches`.
 """
 
 from __future__ import annotations
 
 import inspect
-import logging
 import math
 import threading
-from collections.abc import Callable
-from types import ModuleType
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 from xop_lerobot.core.errors import BadValue, LinkError
 from xop_lerobot.core.shutdown import TermAsInterrupt
 from xop_lerobot.recording.lerobot_patches import (
-    LOOP,
+    CONTEXT_DATASET,
+    CONTEXT_MODULE,
+    POLICY_LOOP,
+    RECORD_DATASET,
+    RECORD_LOOP,
     RECORD_MODULE,
-    ROLLOUT_MODULE,
-    find,
-    find_fault,
-    find_strategy,
-    get_loop_signature,
+    Patched,
+    fits,
+    get_signature,
+    get_stock,
+    runs,
 )
 from xop_lerobot.recording.lockstep import count_ticks, without_slowness
 from xop_lerobot.session import get_session
@@ -34,11 +38,21 @@ from xop_lerobot.session import get_session
 if TYPE_CHECKING:
     from xop_lerobot.recording.dataset import XopDataset
 
-logger = logging.getLogger(__name__)
+_HAS_OWN_LOOP = ContextVar("has_own_loop", default=False)
+
+
+@contextmanager
+def own_loop() -> Iterator[None]:
+    """In the block, teleoperators patch no command of LeRobot: the program has its own loop."""
+    token = _HAS_OWN_LOOP.set(True)
+    try:
+        yield
+    finally:
+        _HAS_OWN_LOOP.reset(token)
 
 
 class Host:
-    """LeRobot's record and rollout modules, as far as this project changes them.
+    """LeRobot's `lerobot-record` and `lerobot-rollout`, as far as this project changes them.
 
     Args:
         session: Session whose episodes are recorded.
@@ -52,71 +66,39 @@ class Host:
         self._session = session
         self._extra_columns = extra_columns
         self._has_person = has_person
-        self._stock: list[tuple[ModuleType | type, str, object, object]] = []
+        self._patched = Patched()
         self._terminator = TermAsInterrupt()
 
     def install(self) -> None:
-        """Replace the names in those of LeRobot's modules that are loaded."""
-        modules = [module for name in (RECORD_MODULE, ROLLOUT_MODULE) if (module := find(name))]
-        if not modules:
-            return
-        fault = find_fault(modules)
-        if fault:
-            logger.warning(
-                "LeRobot has changed (%s), so episodes are recorded WITHOUT the operator's "
-                "columns, and a lock-step episode ends by the wall clock. Use xop-record, or the "
-                "LeRobot version that this release was made for.",
-                fault,
-            )
+        """Patch the command of LeRobot that runs, if it is one that records.
+
+        Raises:
+            LeRobotMisfit: If `lerobot-record` has changed so that episodes would lack something.
+        """
+        records, rolls_out = runs(RECORD_MODULE), runs(CONTEXT_MODULE)
+        if _HAS_OWN_LOOP.get() or not (records or rolls_out):
             return
         from xop_lerobot.recording.dataset import XopDataset  # noqa: PLC0415  brings torch
 
         bound = XopDataset.bind(self._session, extra_columns=self._extra_columns)
-        for module in modules:
-            self._replace(module, "LeRobotDataset", bound)
-            if hasattr(module, "record_loop"):
-                loop = module.record_loop
-                stock = getattr(loop, "xop_stock", loop)
-                self._replace(module, "record_loop", self._wrap_loop(stock))
-        self._hold_policies_to_length()
+        if records and fits(RECORD_DATASET) and fits(RECORD_LOOP):
+            self._patched.put(RECORD_DATASET, bound)
+            self._patched.put(RECORD_LOOP, self._wrap_loop(get_stock(RECORD_LOOP)))
+        if rolls_out and fits(CONTEXT_DATASET):
+            self._patched.put(CONTEXT_DATASET, bound)
+            if fits(POLICY_LOOP):
+                loop = count_in_frames(get_stock(POLICY_LOOP), self._session)
+                self._patched.put(POLICY_LOOP, loop)
         if threading.current_thread() is threading.main_thread():
             self._terminator.install()
 
-    def _hold_policies_to_length(self) -> None:
-        """Let `lerobot-rollout`, if it runs, count frames too, where its loop is as expected."""
-        if find(ROLLOUT_MODULE) is None:
-            return
-        strategy, fault = find_strategy()
-        if strategy is None:
-            logger.warning(
-                "LeRobot has changed (%s), so a lock-step episode of lerobot-rollout ends by the "
-                "wall clock. Use the LeRobot version that this release was made for.",
-                fault,
-            )
-            return
-        loop = getattr(strategy, LOOP)
-        stock = getattr(loop, "xop_stock", loop)
-        ours = count_in_frames(stock, self._session)
-        self._replace(strategy, LOOP, ours)
-
     def remove(self) -> None:
-        """Put LeRobot's own names back; may be called twice."""
-        for module, name, stock, ours in reversed(self._stock):
-            # Another host may have come after this one.
-            if getattr(module, name) is ours:
-                setattr(module, name, stock)
-        self._stock.clear()
+        """Put LeRobot's own back; may be called twice."""
+        self._patched.undo()
         self._terminator.remove()
 
-    def _replace(self, module: ModuleType | type, name: str, ours: Any) -> None:
-        current = getattr(module, name)
-        stock = getattr(current, "xop_stock", current)
-        ours.xop_stock = stock
-        self._stock.append((module, name, stock, ours))
-        setattr(module, name, ours)
-
     def _wrap_loop(self, stock: Callable[..., None]) -> Callable[..., None]:
-        signature = get_loop_signature(stock)
+        signature = get_signature(stock)
 
         def record_loop(*args: Any, **kwargs: Any) -> None:
             """Run LeRobot's `record_loop`; a lock-step episode ends by its number of frames."""

@@ -6,10 +6,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_SLOWNESS = "loop is running slower"
-"""Of LeRobot's warning of a slow tick: of the "Record loop", later of the "Control loop"."""
-_WARNERS = (None, "lerobot.rollout.strategies.episodic", "lerobot.utils.cycle_timer")
-"""Loggers that may give it, by LeRobot's version and command; None is the root."""
+from xop_lerobot.recording.lerobot_patches import SLOW_TICK_LOGGERS, SLOW_TICK_TEXT
 
 
 @contextmanager
@@ -17,9 +14,9 @@ def without_slowness() -> Iterator[None]:
     """Leave out LeRobot's warning of every slow tick: in lock-step none is wrong, only later."""
 
     def is_other(record: logging.LogRecord) -> bool:
-        return _SLOWNESS not in str(record.msg)
+        return SLOW_TICK_TEXT not in str(record.msg)
 
-    warners = [logging.getLogger(name) for name in _WARNERS]
+    warners = [logging.getLogger(name) for name in SLOW_TICK_LOGGERS]
     for warner in warners:
         warner.addFilter(is_other)
     try:

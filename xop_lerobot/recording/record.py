@@ -49,6 +49,7 @@ from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm
 from xop_lerobot.morphology.morphology import list_robot_types
 from xop_lerobot.recording.dataset import XopDataset
+from xop_lerobot.recording.host import own_loop
 from xop_lerobot.recording.lockstep import count_ticks
 from xop_lerobot.recording.resume import check_storage
 from xop_lerobot.recording.tick import run_tick
@@ -145,9 +146,8 @@ def record(config: XopRecordConfig) -> XopDataset:
     init_logging()
     robot_config, teleop_config = check_types(config)
     robot: XopRobot = make_device_from_device_class(robot_config)
-    teleop: Xop = make_device_from_device_class(teleop_config)
-    # LeRobot's own loop is not used here, so it needs no help.
-    teleop.host.remove()
+    with own_loop():
+        teleop: Xop = make_device_from_device_class(teleop_config)
     with stop_on_sigterm(), show_data(config):
         try:
             dataset = open_dataset(config, robot, teleop)

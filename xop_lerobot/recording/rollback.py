@@ -110,8 +110,8 @@ def replace_file(path: Path, content: bytes) -> None:
 def abandon_writers(dataset: LeRobotDataset) -> None:
     """Let LeRobot close `dataset` without writing on what was begun.
 
-    This reaches into private attributes of LeRobot 0.6; where one is missing, nothing is done
-    about it.
+    This takes private attributes of LeRobot, see the patch `ROLLBACK`; where one is missing,
+    nothing is done about it.
     """
     writer, meta = dataset.writer, dataset.meta
     if writer is not None:

@@ -14,15 +14,22 @@ from typing import TYPE_CHECKING, Any
 
 from xop_lerobot.core.command_line import report_mistakes
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.recording.lerobot_patches import find
+from xop_lerobot.recording.lerobot_patches import (
+    ROLLOUT_MODULE,
+    ROLLOUT_PICTURES,
+    Patched,
+    fits,
+    get_signature,
+    get_stock,
+    is_patched,
+    runs,
+)
 
 if TYPE_CHECKING:
     from lerobot_robot_xop.config_xop import XopRobotConfig
 
 logger = logging.getLogger(__name__)
 
-COMMAND_MODULE = "lerobot.scripts.lerobot_rollout"
-BUILD = "build_rollout_context"
 _RESIZING = (
     "resize_shape", "image_resize_shape", "resize_imgs_with_padding", "resize_images_to",
     "image_resolution", "image_size",
@@ -30,37 +37,32 @@ _RESIZING = (
 """Settings of LeRobot's policies that bring pictures of any size to one."""
 
 
-def watch_rollouts(ours: type[XopRobotConfig]) -> None:
+def watch_rollouts(ours: type[XopRobotConfig]) -> Patched:
     """Let `lerobot-rollout`, if that is what runs, check the sizes of pictures first.
 
     Args:
         ours: Configuration of the robots whose pictures are compared.
+
+    Returns:
+        What is patched, which may be undone; nothing where it was before.
     """
-    module = find(COMMAND_MODULE)
-    if module is None:
-        return
-    stock = getattr(module, BUILD, None)
-    if stock is None:
-        logger.warning(
-            "LeRobot has changed (%s has no %s), so nobody compares a policy's pictures with the "
-            "robot's.",
-            COMMAND_MODULE,
-            BUILD,
-        )
-        return
-    if hasattr(stock, "xop_stock"):
-        return
+    patched = Patched()
+    if not (runs(ROLLOUT_MODULE) and fits(ROLLOUT_PICTURES)) or is_patched(ROLLOUT_PICTURES):
+        return patched
     report_mistakes()
+    stock = get_stock(ROLLOUT_PICTURES)
+    signature = get_signature(stock)
 
     @functools.wraps(stock)
-    def build(cfg: Any, *args: Any, **kwargs: Any) -> Any:
+    def build(*args: Any, **kwargs: Any) -> Any:
         """Check the pictures of an xop robot, then do what LeRobot does."""
+        cfg = signature.bind(*args, **kwargs).arguments["cfg"]
         if isinstance(cfg.robot, ours):
             check_pictures(cfg.robot, cfg.policy, getattr(cfg, "rename_map", None) or {})
-        return stock(cfg, *args, **kwargs)
+        return stock(*args, **kwargs)
 
-    build.xop_stock = stock  # pyright: ignore[reportAttributeAccessIssue]
-    setattr(module, BUILD, build)
+    patched.put(ROLLOUT_PICTURES, build)
+    return patched
 
 
 def check_pictures(robot: XopRobotConfig, policy: Any, names: dict[str, str]) -> None:

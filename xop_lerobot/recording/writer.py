@@ -3,9 +3,9 @@
 LeRobot keeps its two parquet writers (frames, and episode metadata) open for a whole session and
 writes their footers only in `finalize`, so SIGKILL loses every episode of the session. Here both
 are closed after each save, and the dataset is put in the state of one that was just resumed: the
-next episode opens new files. This reaches into four private attributes of LeRobot 0.6, so
-`can_rotate` looks for them first; without them `XopDataset` finalizes and resumes instead, which
-uses public methods only and is slower.
+next episode opens new files. This takes private attributes of LeRobot (the patch `ROTATION`);
+without them `XopDataset` finalizes and resumes instead, which uses public methods only and is
+slower.
 
 No video frame is lost: recording waits for the encoder in lock-step, and counts what it drops in
 real time. LeRobot's streaming encoder drops a frame when its queue stays full for 0.1 s. The row
@@ -20,27 +20,16 @@ videos: 5 to 10 ms a frame with our columns, several seconds for an episode of h
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from lerobot.datasets import LeRobotDataset, dataset_writer
+from xop_lerobot.recording.lerobot_patches import EMBEDDING, IMAGES, fits, replaced
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
-
-_WRITER_NAMES = ("_pq_writer", "_latest_episode", "close_writer")
-_META_NAMES = ("_pq_writer", "_close_writer", "latest_episode", "episodes")
-
-
-def can_rotate(dataset: LeRobotDataset) -> bool:
-    """Whether LeRobot still has the attributes that `rotate_writers` needs."""
-    return all(hasattr(dataset.writer, name) for name in _WRITER_NAMES) and all(
-        hasattr(dataset.meta, name) for name in _META_NAMES
-    )
 
 
 def rotate_writers(dataset: LeRobotDataset) -> None:
@@ -65,8 +54,7 @@ def forget_rotation(dataset: LeRobotDataset) -> None:
 @contextmanager
 def skip_embedding(dataset: LeRobotDataset) -> Iterator[None]:
     """In the block, leave the table as it is if `dataset` has no image columns."""
-    stock = getattr(dataset_writer, "embed_images", None)
-    if stock is None or dataset.meta.image_keys:
+    if dataset.meta.image_keys:
         yield
         return
 
@@ -74,14 +62,9 @@ def skip_embedding(dataset: LeRobotDataset) -> Iterator[None]:
         """Return `table`: there is nothing to embed."""
         return table
 
-    dataset_writer.embed_images = keep  # pyright: ignore[reportPrivateImportUsage]
-    try:
+    with replaced(EMBEDDING, keep):
         yield
-    finally:
-        dataset_writer.embed_images = stock  # pyright: ignore[reportPrivateImportUsage]
 
-
-logger = logging.getLogger(__name__)
 
 MAX_IMAGES = 256
 """Pictures that may wait for the disk."""
@@ -98,17 +81,11 @@ class VideoQueue:
 
     def __init__(self, encoder: Any, writer: Any = None) -> None:  # private types
         self._encoder, self._writer = encoder, writer
-        names = ("_frame_queues", "_threads", "_dropped_frames")
-        self._readable = encoder is None or all(hasattr(encoder, name) for name in names)
-        if not self._readable:
-            logger.warning(
-                "LeRobot's video encoder has changed: frames that it drops can be neither "
-                "prevented nor counted. Use --dataset.streaming_encoding=false."
-            )
+        self._bounds_images = fits(IMAGES)
 
     def wait(self) -> None:
         """Wait until every queue takes a frame; a dead encoder is left for LeRobot to report."""
-        if self._encoder is None or not self._readable:
+        if self._encoder is None:
             return
         for key, queue in self._encoder._frame_queues.items():
             while queue.full() and self._encoder._threads[key].is_alive():
@@ -117,17 +94,16 @@ class VideoQueue:
     def wait_for_images(self) -> None:
         """Wait until the image files have caught up; workers that have died are left alone."""
         images = getattr(self._writer, "image_writer", None)
-        queue = getattr(images, "queue", None)
-        if images is None or queue is None:
+        if images is None or not self._bounds_images:
             return
         workers = (*images.threads, *images.processes)
-        while _count(queue) >= MAX_IMAGES and any(worker.is_alive() for worker in workers):
+        while _count(images.queue) >= MAX_IMAGES and any(worker.is_alive() for worker in workers):
             time.sleep(_POLL_S)
 
     @property
     def dropped(self) -> int:
         """Frames dropped in this episode, over all cameras."""
-        if self._encoder is None or not self._readable:
+        if self._encoder is None:
             return 0
         return sum(self._encoder._dropped_frames.values())
 
