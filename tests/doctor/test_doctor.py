@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import importlib.metadata
 import json
 import re
 import socket
@@ -40,6 +41,8 @@ from xop_lerobot.doctor.checks import (
 from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.certificate import get_certificate
+
+LEROBOT = importlib.metadata.version("lerobot")
 
 
 def test_interpreter(monkeypatch):
@@ -81,14 +84,21 @@ def test_children_may_crash_and_hang():
 
 
 def test_plugin(monkeypatch):
-    known = {"robots": ["xop_g1", "xop_rby1"], "teleoperators": ["xop"]}
+    known: dict = {
+        "robots": ["xop_g1", "xop_rby1"], "teleoperators": ["xop"], "patches": 15, "refused": [],
+        "warned": [],
+    }  # fmt: skip
 
     def answer(ok: bool, value: object) -> Finding:
         text = value if isinstance(value, str) else f"noise\n{json.dumps(value)}"
         monkeypatch.setattr(checks, "run_child", lambda *_, **__: Answer(ok, text))
         return check_plugin(Setup())
 
-    assert answer(True, known).level is Level.OK
+    fine = answer(True, known)
+    assert (fine.level, fine.text) == (
+        Level.OK,
+        f"LeRobot {LEROBOT} knows xop_g1, xop_rby1 and the teleoperator xop; all 15 patches fit it",
+    )
     missing = answer(True, known | {"robots": ["xop_g1"], "teleoperators": []})
     assert (missing.level, missing.text) == (Level.FAIL, "LeRobot does not know xop_rby1, xop")
     assert (
@@ -96,9 +106,32 @@ def test_plugin(monkeypatch):
     )
 
 
+@pytest.mark.parametrize(
+    ("refused", "warned", "level"), [([], ["b."], Level.WARN), (["a."], ["b."], Level.FAIL)]
+)
+def test_a_lerobot_that_does_not_fit(monkeypatch, refused, warned, level):
+    known = {
+        "robots": ["xop_g1", "xop_rby1"], "teleoperators": ["xop"], "patches": 15,
+        "refused": refused, "warned": warned,
+    }  # fmt: skip
+    monkeypatch.setattr(checks, "run_child", lambda *_, **__: Answer(True, json.dumps(known)))
+    found = check_plugin(Setup())
+    assert (found.level, found.figures["misfits"]) == (level, [*refused, *warned])
+    assert found.text == (
+        f"LeRobot {LEROBOT} knows xop_g1, xop_rby1 and the teleoperator xop; of 15 patches of it "
+        f"{len(refused + warned)} do not fit. {' '.join(refused + warned)}"
+    )
+    assert found.advice == (
+        "install the LeRobot that this release is made for (pip install -e .), or a newer release "
+        "of this project"
+    )
+
+
 @pytest.mark.slow
 def test_plugin_of_this_machine():
-    assert check_plugin(Setup()).level is Level.OK
+    found = check_plugin(Setup())
+    assert found.level is Level.OK
+    assert found.text.endswith("; all 15 patches fit it")
 
 
 def test_disk(tmp_path, monkeypatch):

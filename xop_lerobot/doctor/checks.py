@@ -483,13 +483,21 @@ from lerobot.utils.import_utils import register_third_party_plugins
 register_third_party_plugins()
 from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators.config import TeleoperatorConfig
+from xop_lerobot.recording.lerobot_patches import PATCHES, find_misfit
+misfits = [(find_misfit(patch), patch.required) for patch in PATCHES]
 print(json.dumps({"robots": sorted(RobotConfig.get_known_choices()),
-                  "teleoperators": sorted(TeleoperatorConfig.get_known_choices())}))
+                  "teleoperators": sorted(TeleoperatorConfig.get_known_choices()),
+                  "patches": len(PATCHES),
+                  "refused": [text for text, required in misfits if text and required],
+                  "warned": [text for text, required in misfits if text and not required]}))
 """
 
 
 def check_plugin(setup: Setup) -> Finding:
-    """List LeRobot's types as its commands do, in a separate process."""
+    """List LeRobot's types as its commands do, and check what is patched in it.
+
+    In a separate process.
+    """
     del setup
     answer = run_child(_PLUGIN_CODE, timeout=300.0)
     if not answer.ok:
@@ -508,6 +516,23 @@ def check_plugin(setup: Setup) -> Finding:
             "for a warning of LeRobot's about a plugin that it could not import",
             {"missing": missing},
         )
+    here = (
+        f"LeRobot {importlib.metadata.version('lerobot')} knows {', '.join(WANTED['robots'])} and "
+        "the teleoperator xop"
+    )
+    misfits = [*known["refused"], *known["warned"]]
+    if misfits:
+        return Finding(
+            Level.FAIL if known["refused"] else Level.WARN,
+            f"{here}; of {known['patches']} patches of it {len(misfits)} do not fit. "
+            + " ".join(misfits),
+            "install the LeRobot that this release is made for (pip install -e .), or a newer "
+            "release of this project",
+            {"patches": known["patches"], "misfits": misfits},
+        )
     return Finding(
-        Level.OK, f"LeRobot knows {', '.join(WANTED['robots'])} and the teleoperator xop"
+        Level.OK,
+        f"{here}; all {known['patches']} patches fit it",
+        "",
+        {"patches": known["patches"], "misfits": []},
     )
