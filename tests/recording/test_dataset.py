@@ -34,15 +34,11 @@ from xop_lerobot.core.state import FRAMES, Goal
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.recording import writer
 from xop_lerobot.recording.columns import COST_NAMES, HEALTH_NAMES, Columns
-from xop_lerobot.recording.dataset import (
-    BatchedEncoding,
-    DatasetExists,
-    WrongFps,
-    XopDataset,
-)
+from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.executed import put_executed
 from xop_lerobot.recording.facts import compute_config_hash, read_facts
 from xop_lerobot.recording.lerobot_patches import ROTATION, LeRobotMisfit
+from xop_lerobot.recording.opening import BatchedEncoding, DatasetExists, WrongFps
 from xop_lerobot.recording.record import build_features
 from xop_lerobot.recording.writer import MAX_IMAGES, VideoQueue
 from xop_lerobot.session import Executed, Outcome, TickRecord, get_session

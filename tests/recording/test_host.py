@@ -26,9 +26,10 @@ from toy_robot import SMALL, XopToyConfig, make_teleop, make_toy
 from tests.recording.test_dataset import STREAMING, tick
 from xop_lerobot.core.errors import BadValue, LinkError
 from xop_lerobot.recording import host, lerobot_patches
-from xop_lerobot.recording.dataset import DatasetExists, WrongFps, XopDataset
+from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.recording.lerobot_patches import LeRobotMisfit
+from xop_lerobot.recording.opening import DatasetExists, WrongFps
 from xop_lerobot.recording.record import build_features
 
 STOCK_DATASET, STOCK_LOOP = LeRobotDataset, record_module.record_loop

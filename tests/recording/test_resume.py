@@ -17,8 +17,8 @@ from tests.recording.test_rollback import read_files
 from xop_lerobot.core.errors import BadDataset, BadValue
 from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.facts import CONFIG_FILE, CONFIGS_DIR, read_facts
+from xop_lerobot.recording.opening import NotResumable
 from xop_lerobot.recording.record import build_features
-from xop_lerobot.recording.resume import NotResumable
 
 pytestmark = pytest.mark.slow
 

@@ -21,8 +21,9 @@ from toy_robot import make_toy
 from tests.recording import test_dataset
 from tests.recording.test_dataset import REPO, STREAMING, create, pair, session, tick  # noqa: F401  fixtures
 from xop_lerobot.recording import dataset as xop_dataset
-from xop_lerobot.recording.dataset import NotMade, XopDataset
+from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.facts import append_facts, read_facts
+from xop_lerobot.recording.opening import NotMade
 from xop_lerobot.recording.rollback import NotSaved, find_reason
 
 FULL = "No space left on device"

@@ -13,20 +13,18 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, MutableMapping
+from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Self, cast
 
-import numpy as np
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from xop_lerobot.core.errors import BadDataset, BadValue, XopError
+from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.shutdown import hold_signals
 from xop_lerobot.core.state import RobotState
-from xop_lerobot.core.versions import read_versions
 from xop_lerobot.operator.display import Cue, Progress, Wish
 from xop_lerobot.recording import writer
 from xop_lerobot.recording.columns import Columns, has_all_columns, is_own_column
@@ -37,12 +35,12 @@ from xop_lerobot.recording.facts import (
     EpisodeFacts,
     append_facts,
     compute_config_hash,
+    gather_facts,
     keep_config,
     to_plain,
 )
 from xop_lerobot.recording.lerobot_patches import (
     DATASET,
-    ENCODER,
     EPISODE_METADATA,
     ROLLBACK,
     ROTATION,
@@ -50,60 +48,25 @@ from xop_lerobot.recording.lerobot_patches import (
     fits,
     get_stock,
 )
+from xop_lerobot.recording.opening import (
+    DatasetExists,
+    NotMade,
+    WrongFps,
+    check_encoding,
+    check_resumable,
+    find_unreadable,
+)
 from xop_lerobot.recording.requests import Tally, grant
-from xop_lerobot.recording.resume import check_resumable
 from xop_lerobot.recording.rollback import (
-    Checkpoint,
-    NotSaved,
-    abandon_writers,
     check_pictures,
     find_reason,
+    raise_if_not_written,
+    taken_back_on_failure,
 )
 from xop_lerobot.recording.writer import VideoQueue, keep_schedule, skip_embedding
 from xop_lerobot.session import RobotInfo, Session, TickRecord, get_session
 
 logger = logging.getLogger(__name__)
-
-_LATE = 0.95
-"""Share of its rate under which a real-time episode is marked as late."""
-
-
-class DatasetExists(XopError, FileExistsError):
-    """The directory of a new dataset is there already."""
-
-    def __init__(self, root: Path) -> None:
-        super().__init__(
-            f"dataset directory '{root}' exists already. Choose another --dataset.root, delete "
-            "it, or add episodes to it with --resume=true"
-        )
-
-
-class NotMade(XopError):
-    """The directory of a new dataset cannot be made."""
-
-    def __init__(self, root: Path, reason: str) -> None:
-        super().__init__(f"dataset directory '{root}' cannot be made: {reason}")
-
-
-class WrongFps(XopError, ValueError):
-    """Robot and dataset run at different rates."""
-
-    def __init__(self, robot_fps: int, dataset_fps: int) -> None:
-        super().__init__(
-            f"the robot runs at {robot_fps} Hz (--robot.fps) and the dataset at {dataset_fps} Hz "
-            f"(--dataset.fps); they must be equal. Use --dataset.fps={robot_fps}"
-        )
-
-
-class BatchedEncoding(XopError, ValueError):
-    """Videos should be encoded later than their episodes are saved."""
-
-    def __init__(self, size: int) -> None:
-        super().__init__(
-            f"--dataset.video_encoding_batch_size must be 1, got {size}: an episode is saved with "
-            "its videos, so that what happens later can't take them. To save sooner, use "
-            "--dataset.streaming_encoding=true"
-        )
 
 
 class XopDataset(LeRobotDataset):
@@ -151,7 +114,7 @@ class XopDataset(LeRobotDataset):
         """
         info = get_session(cls.session_name).robot
         fits(DATASET)
-        _check_encoding(options)
+        check_encoding(options)
         if fps != info.fps:
             raise WrongFps(info.fps, fps)
         folder = Path(root) if root else HF_LEROBOT_HOME / repo_id
@@ -189,7 +152,7 @@ class XopDataset(LeRobotDataset):
         """
         info = get_session(cls.session_name).robot
         fits(DATASET)
-        _check_encoding(options)
+        check_encoding(options)
         dataset = cls._open(repo_id, root, options)
         try:
             columns = dataset._check_fit(info)
@@ -217,19 +180,11 @@ class XopDataset(LeRobotDataset):
         try:
             return cast("Self", super().resume(repo_id, root=root, **options))
         except Exception as error:  # of JSON, parquet or the Hub, whatever is wrong with the files
-            first = (str(error).splitlines() or [""])[0]
-            fault = f"it cannot be read ({type(error).__name__}: {first}). "
-            if (folder / "meta" / "info.json").exists():
-                fault += f"`xop-curate repair --root {folder} --out DIR` makes a whole one of it"
-            else:
-                fault = (
-                    f"there is none to add to, nor is '{repo_id}' on the Hub or within reach. "
-                    "Leave --resume out to begin it"
-                )
+            unreadable = find_unreadable(folder, repo_id, error)
             if not existed:
                 with suppress(OSError):
                     folder.rmdir()  # LeRobot makes it
-            raise BadDataset(folder, fault) from error
+            raise unreadable from error
 
     def _check_fit(self, info: RobotInfo) -> Columns | None:
         """Check that the robot's episodes fit; return our columns, None if there are none."""
@@ -371,7 +326,7 @@ class XopDataset(LeRobotDataset):
         try:
             super().add_frame(frame)
         except Exception as error:
-            self._explain(error)
+            raise_if_not_written(self, error)
             raise
         if state is not None:
             tally.note_state(state)
@@ -423,8 +378,8 @@ class XopDataset(LeRobotDataset):
                 f"episode {index} lost {facts.dropped_frames} video frames; it is not saved"
             )
         length = self._tally.frames
-        self._write_mark(episode_data)
-        with hold_signals(), skip_embedding(self), keep_schedule(), self._taken_back_on_failure():
+        self._tally.write_mark(episode_data or (self.writer.episode_buffer if self.writer else {}))
+        with hold_signals(), skip_embedding(self), keep_schedule(), taken_back_on_failure(self):
             check_pictures(self, index)
             super().save_episode(episode_data, parallel_encoding)
             self._secure()
@@ -440,47 +395,6 @@ class XopDataset(LeRobotDataset):
                 self.fps,
             )
         self._begin_next(index + 1)
-
-    @contextmanager
-    def _taken_back_on_failure(self) -> Iterator[None]:
-        """Save in the block; if that fails, close the dataset as it was before.
-
-        Raises:
-            NotSaved: If the system did not write.
-        """
-        info = self.meta.info
-        counts = info.total_episodes, info.total_frames
-        checkpoint = Checkpoint(self.root)
-        try:
-            yield
-        except Exception as error:
-            abandon_writers(self)
-            whole = checkpoint.restore()
-            # `resume` may have made others meanwhile, in `_secure`.
-            self.meta.info.total_episodes, self.meta.info.total_frames = counts
-            self.finalize()
-            self._explain(error, whole=whole)
-            raise
-
-    def _explain(self, error: Exception, *, whole: bool = True) -> None:
-        """Say in one line that the system did not write, if that is what `error` comes from.
-
-        Raises:
-            NotSaved: If it is.
-        """
-        reason = find_reason(error)
-        if reason and not isinstance(error, NotSaved):
-            raise NotSaved(self.root, self.meta.total_episodes, reason, whole=whole) from error
-
-    def _write_mark(self, episode_data: dict | None) -> None:
-        """Bring `next.success` in line with the operator's mark, as `xop-curate label` does."""
-        marked = self._tally.marked
-        buffer = episode_data or (self.writer.episode_buffer if self.writer else {})
-        rows = buffer.get("next.success")
-        if marked is None or not rows:
-            return
-        rows[:] = [row if marked else np.zeros_like(row) for row in rows]
-        rows[-1] = np.full_like(rows[-1], marked)
 
     def clear_episode_buffer(self, delete_images: bool = True) -> None:
         """Discard the episode and ask the robot to start over."""
@@ -521,42 +435,4 @@ class XopDataset(LeRobotDataset):
         self._attach_writer()
 
     def _collect_facts(self) -> EpisodeFacts:
-        tally, info = self._tally, self._info
-        return EpisodeFacts(
-            success=tally.success,
-            fallen=tally.fallen,
-            collision=tally.collision,
-            finished=tally.finished,
-            seed=info.seed,
-            task=tally.task,
-            robot=info.name,
-            scene=info.scene,
-            low_level=info.low_level,
-            clock="realtime" if info.realtime else "lockstep",
-            config_hash=self._config_hash,
-            versions=read_versions(),
-            start_time=tally.start_time,
-            real_fps=tally.fps,
-            dropped_frames=self._video.dropped,
-            settings=json.dumps(tally.settings),
-            changes=json.dumps(tally.changes),
-            late=info.realtime and tally.frames > 1 and tally.fps < _LATE * info.fps,
-        )
-
-
-def _check_encoding(options: Mapping[str, Any]) -> None:
-    """Refuse encoding that may lose pictures.
-
-    LeRobot encodes batches of videos after their episodes are saved. Each episode has files of its
-    own here, closed when it is saved; a batch would look for the rows of all its episodes in one of
-    them, and a killed process would lose its pictures.
-
-    Raises:
-        BatchedEncoding: If a batch is larger than one episode.
-        LeRobotMisfit: If LeRobot's streaming encoder cannot be waited for.
-    """
-    size = options.get("batch_encoding_size", 1)
-    if size > 1:
-        raise BatchedEncoding(size)
-    if options.get("streaming_encoding"):
-        fits(ENCODER)
+        return gather_facts(self._tally, self._info, self._config_hash, self._video.dropped)

@@ -14,7 +14,13 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from xop_lerobot.core.versions import read_versions
+
+if TYPE_CHECKING:
+    from xop_lerobot.recording.requests import Tally
+    from xop_lerobot.session import RobotInfo
 
 from xop_lerobot.core.folders import append_line, read_lines
 
@@ -78,6 +84,41 @@ class EpisodeFacts:
     def to_metadata(self) -> dict[str, Any]:
         """Return the facts as columns of LeRobot's episode metadata."""
         return {f"{FACTS_PREFIX}{key}": value for key, value in dataclasses.asdict(self).items()}
+
+
+_LATE = 0.95
+"""Share of its rate under which a real-time episode is marked as late."""
+
+
+def gather_facts(tally: Tally, info: RobotInfo, config_hash: str, dropped: int) -> EpisodeFacts:
+    """Gather the facts on the episode that is being recorded.
+
+    Args:
+        tally: What was counted in it.
+        info: Its robot.
+        config_hash: Hash of its configuration.
+        dropped: Video frames that the encoder dropped.
+    """
+    return EpisodeFacts(
+        success=tally.success,
+        fallen=tally.fallen,
+        collision=tally.collision,
+        finished=tally.finished,
+        seed=info.seed,
+        task=tally.task,
+        robot=info.name,
+        scene=info.scene,
+        low_level=info.low_level,
+        clock="realtime" if info.realtime else "lockstep",
+        config_hash=config_hash,
+        versions=read_versions(),
+        start_time=tally.start_time,
+        real_fps=tally.fps,
+        dropped_frames=dropped,
+        settings=json.dumps(tally.settings),
+        changes=json.dumps(tally.changes),
+        late=info.realtime and tally.frames > 1 and tally.fps < _LATE * info.fps,
+    )
 
 
 FACT_COLUMNS = tuple(f"{FACTS_PREFIX}{each.name}" for each in dataclasses.fields(EpisodeFacts))

@@ -51,7 +51,7 @@ from xop_lerobot.morphology.morphology import list_robot_types
 from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.host import own_loop
 from xop_lerobot.recording.lockstep import count_ticks
-from xop_lerobot.recording.resume import check_storage
+from xop_lerobot.recording.opening import check_storage
 from xop_lerobot.recording.tick import run_tick
 
 if TYPE_CHECKING:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from typing import Any
+
+import numpy as np
 
 from xop_lerobot.core.state import RobotState
 from xop_lerobot.operator.display import Cue, Wish
@@ -60,6 +62,18 @@ class Tally:
         """Take down what the operator says of the episode, at `time` [s] of the robot's clock."""
         self.marked = self.success = success
         self._note(max(self.frames - 1, 0), time, "operator", {"success": success})
+
+    def write_mark(self, buffer: Mapping[str, Any]) -> None:
+        """Bring `next.success` in line with the operator's mark, as `xop-curate label` does.
+
+        Args:
+            buffer: The rows of the episode that are not saved yet, by column.
+        """
+        rows = buffer.get("next.success")
+        if self.marked is None or not rows:
+            return
+        rows[:] = [row if self.marked else np.zeros_like(row) for row in rows]
+        rows[-1] = np.full_like(rows[-1], self.marked)
 
     def _note(self, frame: int, time: float, source: str, change: dict[str, Any]) -> None:
         self.changes.append({"frame": frame, "time": time, "source": source, "change": change})

@@ -12,7 +12,7 @@ import errno
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,6 +135,40 @@ def _drop(parquet: Any) -> None:
     parquet.is_open = False  # else it is closed, and fails, again when it is collected
     with suppress(Exception):
         parquet.file_handle.close()
+
+
+@contextmanager
+def taken_back_on_failure(dataset: LeRobotDataset) -> Iterator[None]:
+    """Save an episode in the block; if that fails, close `dataset` as it was before.
+
+    Raises:
+        NotSaved: If the system did not write.
+    """
+    info = dataset.meta.info
+    counts = info.total_episodes, info.total_frames
+    checkpoint = Checkpoint(dataset.root)
+    try:
+        yield
+    except Exception as error:
+        abandon_writers(dataset)
+        whole = checkpoint.restore()
+        # `dataset` may have opened others meanwhile, to close the files of the episode.
+        dataset.meta.info.total_episodes, dataset.meta.info.total_frames = counts
+        dataset.finalize()
+        raise_if_not_written(dataset, error, whole=whole)
+        raise
+
+
+def raise_if_not_written(dataset: LeRobotDataset, error: Exception, *, whole: bool = True) -> None:
+    """Say in one line that the system did not write, if that is what `error` comes from.
+
+    Raises:
+        NotSaved: If it is.
+    """
+    reason = find_reason(error)
+    if reason and not isinstance(error, NotSaved):
+        index = dataset.meta.total_episodes
+        raise NotSaved(dataset.root, index, reason, whole=whole) from error
 
 
 def check_pictures(dataset: LeRobotDataset, index: int) -> None:

@@ -1,4 +1,4 @@
-"""May a dataset be added to: does it hold what the robot would record, and nothing more?"""
+"""May a dataset be made, or be added to: does it hold what the robot would record, and no more?"""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot.utils.constants import ACTION, DEFAULT_FEATURES, OBS_IMAGES, OBS_STATE
 
-from xop_lerobot.core.errors import XopError
+from xop_lerobot.core.errors import BadDataset, XopError
 from xop_lerobot.morphology.body import Body
 from xop_lerobot.recording.columns import is_own_column
+from xop_lerobot.recording.lerobot_patches import ENCODER, fits
 
 if TYPE_CHECKING:
     from xop_lerobot.session import RobotInfo
@@ -18,6 +19,44 @@ if TYPE_CHECKING:
 PICTURES = f"{OBS_IMAGES}."
 _OTHERS = ("intervention",)
 """Columns that LeRobot's rollouts fill beside those of the robot."""
+
+
+class DatasetExists(XopError, FileExistsError):
+    """The directory of a new dataset is there already."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(
+            f"dataset directory '{root}' exists already. Choose another --dataset.root, delete "
+            "it, or add episodes to it with --resume=true"
+        )
+
+
+class NotMade(XopError):
+    """The directory of a new dataset cannot be made."""
+
+    def __init__(self, root: Path, reason: str) -> None:
+        super().__init__(f"dataset directory '{root}' cannot be made: {reason}")
+
+
+class WrongFps(XopError, ValueError):
+    """Robot and dataset run at different rates."""
+
+    def __init__(self, robot_fps: int, dataset_fps: int) -> None:
+        super().__init__(
+            f"the robot runs at {robot_fps} Hz (--robot.fps) and the dataset at {dataset_fps} Hz "
+            f"(--dataset.fps); they must be equal. Use --dataset.fps={robot_fps}"
+        )
+
+
+class BatchedEncoding(XopError, ValueError):
+    """Videos should be encoded later than their episodes are saved."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__(
+            f"--dataset.video_encoding_batch_size must be 1, got {size}: an episode is saved with "
+            "its videos, so that what happens later can't take them. To save sooner, use "
+            "--dataset.streaming_encoding=true"
+        )
 
 
 class NotResumable(XopError, ValueError):
@@ -28,6 +67,44 @@ class NotResumable(XopError, ValueError):
             f"'{root}' cannot be added to: {'; '.join(faults)}. Record as it was recorded, or "
             "begin another --dataset.root without --resume=true"
         )
+
+
+def check_encoding(options: Mapping[str, Any]) -> None:
+    """Refuse encoding that may lose pictures.
+
+    LeRobot encodes batches of videos after their episodes are saved. Each episode has files of its
+    own here, closed when it is saved; a batch would look for the rows of all its episodes in one of
+    them, and a killed process would lose its pictures.
+
+    Raises:
+        BatchedEncoding: If a batch is larger than one episode.
+        LeRobotMisfit: If LeRobot's streaming encoder cannot be waited for.
+    """
+    size = options.get("batch_encoding_size", 1)
+    if size > 1:
+        raise BatchedEncoding(size)
+    if options.get("streaming_encoding"):
+        fits(ENCODER)
+
+
+def find_unreadable(folder: Path, repo_id: str, error: Exception) -> BadDataset:
+    """Say why a dataset could not be opened to be added to, and what to do.
+
+    Args:
+        folder: Its directory.
+        repo_id: Its name on the Hub.
+        error: What LeRobot has raised: of JSON, parquet or the Hub, whatever is wrong.
+    """
+    first = (str(error).splitlines() or [""])[0]
+    fault = f"it cannot be read ({type(error).__name__}: {first}). "
+    if (folder / "meta" / "info.json").exists():
+        fault += f"`xop-curate repair --root {folder} --out DIR` makes a whole one of it"
+    else:
+        fault = (
+            f"there is none to add to, nor is '{repo_id}' on the Hub or within reach. "
+            "Leave --resume out to begin it"
+        )
+    return BadDataset(folder, fault)
 
 
 def check_resumable(
