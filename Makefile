@@ -49,8 +49,12 @@ type: setup  ## Check the types
 
 check: lint type test  ## Everything that a change must pass
 
-lock: setup  ## Write the versions installed in .venv to requirements.lock
-	@$(PYTHON) scripts/setup.py --write-lock
+lock: | $(VENV)/bin/uv  ## Lock what pyproject.toml asks for; LOCK=--upgrade takes newer versions
+	@$(VENV)/bin/uv pip compile --quiet --universal --python-version 3.12 --extra dev --generate-hashes \
+		--no-annotate --custom-compile-command "make lock" --output-file requirements.lock $(LOCK) pyproject.toml
+
+$(VENV)/bin/uv:
+	@sh scripts/setup.sh
 
 clean:  ## Remove .venv, caches and builds; recordings in outputs/ stay
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -6,38 +6,30 @@ Standard library only, since nothing is installed yet. docs/start/setup.md expla
 from __future__ import annotations
 
 import argparse
+import ast
 import ctypes
 import fcntl
 import os
-import queue
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 PYTHON = VENV / "bin" / "python"
 STAMP = VENV / ".xop-stamp"
-LOG = VENV / "setup.log"
 LOCK_FILE = ROOT / "requirements.lock"
+MINOR = f"{sys.version_info.major}.{sys.version_info.minor}"
 
-PIP = "pip==26.3"
-"""Older ones drop extras of a package without a word."""
-DISTRIBUTION = "lerobot_teleoperator_xop"
 NEEDED_GB = 8.0
-"""Room for `.venv` (6.4 GB) and the archives on their way into it [GB]."""
-UNLOADABLE = "torchcodec"
-"""Taken out of `.venv` where it can't load; its pin stays."""
-HEARTBEAT_S = 20.0
-"""Period of a sign of life where the output is no terminal [s]."""
-TAIL_LINES = 25
-
+"""Room for `.venv` (7 GB) and the archives on their way into it [GB]."""
 RENDER_CHECK = """
 import mujoco
 model = mujoco.MjModel.from_xml_string(
@@ -49,56 +41,106 @@ with mujoco.Renderer(model, 48, 64) as renderer:
     assert renderer.render().max() > 0, "the picture is black"
 """
 
-GL_PACKAGES = {
-    "apt-get": ("libegl1", "libgl1", "libgl1-mesa-dri"),
-    "dnf": ("mesa-libEGL", "mesa-libGL", "mesa-dri-drivers"),
-    "pacman": ("mesa", "libglvnd"),
-    "zypper": ("Mesa-libEGL1", "Mesa-libGL1", "Mesa-dri"),
+VENV_MODULE = "Python's venv"
+RENDERING = "software rendering (Mesa's EGL)"
+COMPILER = "a C compiler"
+HEADERS = "Python's C headers"
+PACKAGES = {
+    VENV_MODULE: {"apt-get": f"python{MINOR}-venv"},
+    RENDERING: {
+        "apt-get": "libegl1 libgl1 libgl1-mesa-dri",
+        "dnf": "mesa-libEGL mesa-libGL mesa-dri-drivers",
+        "pacman": "mesa libglvnd",
+        "zypper": "Mesa-libEGL1 Mesa-libGL1 Mesa-dri",
+    },
+    COMPILER: {
+        "apt-get": "gcc libc6-dev linux-libc-dev",
+        "dnf": "gcc glibc-devel kernel-headers",
+        "pacman": "gcc linux-api-headers",
+        "zypper": "gcc glibc-devel linux-glibc-devel",
+    },
+    HEADERS: {
+        "apt-get": f"python{MINOR}-dev",
+        "dnf": f"python{MINOR}-devel",
+        "pacman": "python",
+        "zypper": f"python{MINOR.replace('.', '')}-devel",
+    },
+    # What tests of pages need: npm brings Node.js, and fetches the headset's emulator.
+    "Chromium": dict.fromkeys(("apt-get", "dnf", "pacman", "zypper"), "chromium"),
+    "certutil": {
+        "apt-get": "libnss3-tools",
+        "dnf": "nss-tools",
+        "pacman": "nss",
+        "zypper": "mozilla-nss-tools",
+    },
+    "npm": {"apt-get": "npm", "dnf": "npm", "pacman": "npm", "zypper": "npm-default"},
 }
-COMPILER_PACKAGES = {
-    "apt-get": ("gcc", "libc6-dev", "linux-libc-dev"),
-    "dnf": ("gcc", "glibc-devel", "kernel-headers"),
-    "pacman": ("gcc", "linux-api-headers"),
-    "zypper": ("gcc", "glibc-devel", "linux-glibc-devel"),
+"""The packages of each package manager that bring a thing which pip and uv can't."""
+INSTALL_COMMANDS = {
+    "apt-get": "apt-get install -y --no-install-recommends",
+    "dnf": "dnf install -y",
+    "pacman": "pacman -S --noconfirm --needed",
+    "zypper": "zypper --non-interactive install",
 }
-PYTHON_HEADERS = {"apt-get": "python{}-dev", "dnf": "python{}-devel", "zypper": "python{}-devel"}
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 """Programs that `tests/helpers/browser.py` starts, whichever is found first."""
-TEST_PACKAGES = {
-    "apt-get": {"Chromium": "chromium", "certutil": "libnss3-tools", "npm": "npm"},
-    "dnf": {"Chromium": "chromium", "certutil": "nss-tools", "npm": "npm"},
-    "pacman": {"Chromium": "chromium", "certutil": "nss", "npm": "npm"},
-    "zypper": {"Chromium": "chromium", "certutil": "mozilla-nss-tools", "npm": "npm-default"},
+
+UV_SETTINGS = {
+    "index-url": "UV_DEFAULT_INDEX",
+    "extra-index-url": "UV_INDEX",
+    "find-links": "UV_FIND_LINKS",
+    "no-index": "UV_NO_INDEX",
+    "constraint": "UV_CONSTRAINT",
+    "trusted-host": "UV_INSECURE_HOST",
+    "default-timeout": "UV_HTTP_TIMEOUT",
+    "timeout": "UV_HTTP_TIMEOUT",
+    "cert": "SSL_CERT_FILE",
+    "proxy": "ALL_PROXY",
 }
-"""What tests of pages need beside: npm brings Node.js, and fetches the headset's emulator."""
-INSTALL_COMMANDS = {
-    "apt-get": ("apt-get", "install", "-y", "--no-install-recommends"),
-    "dnf": ("dnf", "install", "-y"),
-    "pacman": ("pacman", "-S", "--noconfirm", "--needed"),
-    "zypper": ("zypper", "--non-interactive", "install"),
-}
+"""pip's settings that uv has too, by the variable that tells uv."""
 
 
 class SetupError(Exception):
     """The set-up can't go on; the message says what to do."""
 
 
-def find_manager() -> str | None:
-    """Return the system's package manager, None where it is none that is known here."""
-    return next((name for name in INSTALL_COMMANDS if shutil.which(name)), None)
+def say(line: str) -> None:
+    """Print one line at once."""
+    print(line, flush=True)
 
 
-def find_root_prefix() -> tuple[str, ...] | None:
-    """Return what makes a command run as root without a question, None where that may not be."""
-    if os.environ.get("XOP_NO_SYSTEM", "0") == "1":
+def make_clean_environment() -> dict[str, str]:
+    """Return the environment less what would lead pip to another Python's packages."""
+    unwanted = {"PYTHONPATH", "PYTHONHOME", "PIP_TARGET", "PIP_PREFIX", "PIP_USER"}
+    return {key: value for key, value in os.environ.items() if key not in unwanted}
+
+
+def ask(*command: str | Path) -> str | None:
+    """Return what a command prints, None where it fails or can't be started."""
+    try:
+        answer = subprocess.run(
+            command, env=make_clean_environment(), capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
         return None
-    if os.geteuid() == 0:
-        return ()
-    if shutil.which("sudo"):
-        asked = subprocess.run(["sudo", "-n", "true"], capture_output=True, check=False)
-        if asked.returncode == 0:
-            return ("sudo", "-n")
-    return None
+    return answer.stdout
+
+
+def run(*command: str | Path, environment: dict[str, str] | None = None) -> None:
+    """Run a command that installs something, its output as it comes.
+
+    Raises:
+        SetupError: If it fails.
+    """
+    environment = environment or make_clean_environment()
+    if subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode:
+        raise SetupError(
+            f"the command above failed:\n  {' '.join(map(str, command))}\nRun `make` again after "
+            "mending it; what is there already stays."
+        )
+
+
+# -- what the system has to bring ---------------------------------------------------------------
 
 
 def is_loadable(library: str) -> bool:
@@ -110,75 +152,20 @@ def is_loadable(library: str) -> bool:
     return True
 
 
-def lacks_gl() -> bool:
-    """Whether software rendering lacks a library (EGL, its Mesa vendor, or GL itself)."""
-    if sys.platform != "linux" or os.environ.get("MUJOCO_GL", "egl") != "egl":
-        return False
-    return not all(map(is_loadable, ("libEGL.so.1", "libGL.so.1")))
-
-
-def lacks_compiler() -> bool:
-    """Whether a C compiler or a header is missing that the dependency evdev is built with."""
-    if sys.platform != "linux" or any(VENV.glob("lib/python3.*/site-packages/evdev/__init__.py")):
-        return False
-    headers = (Path(sysconfig.get_path("include")) / "Python.h", Path("/usr/include/linux/input.h"))
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    return not (compiler and all(header.exists() for header in headers))
-
-
-def list_system_packages(manager: str, gl: bool, compiler: bool) -> list[str]:
-    """List the packages of `manager` that bring rendering and a compiler."""
-    packages = list(GL_PACKAGES[manager]) if gl else []
-    if compiler:
-        packages += COMPILER_PACKAGES[manager]
-        own_headers = Path(sysconfig.get_path("include")) / "Python.h"
-        if not own_headers.exists() and manager in PYTHON_HEADERS:
-            minor = f"{sys.version_info.major}.{sys.version_info.minor}"
-            packages.append(PYTHON_HEADERS[manager].format(minor))
-    return packages
-
-
-def install_system_packages(gl: bool, compiler: bool) -> None:
-    """Install what the system lacks.
-
-    Raises:
-        SetupError: If it may not be installed, or the package manager fails; carries the command.
-    """
-    names = [
-        name
-        for name, lacking in (("software rendering (Mesa's EGL)", gl), ("a C compiler", compiler))
-        if lacking
-    ]
-    missing = " and ".join(names)
-    verb = "is" if len(names) == 1 else "are"
-    manager = find_manager()
-    if manager is None:
-        raise SetupError(f"{missing} {verb} missing. Install with the system's package manager.")
-    packages = list_system_packages(manager, gl, compiler)
-    command = (*INSTALL_COMMANDS[manager], *packages)
-    by_hand = f"sudo {' '.join(command)}"
-    prefix = find_root_prefix()
-    if prefix is None:
-        raise SetupError(
-            f"{missing} {verb} missing and may not be installed here. Run:\n  {by_hand}"
-        )
-    say(f"Installing {missing}: {' '.join(packages)} (XOP_NO_SYSTEM=1 forbids it)")
-    refresh_lists(manager, prefix)
-    if not install_packages(manager, prefix, packages):
-        raise SetupError(f"the package manager failed:\n{read_tail()}\nRun by hand:\n  {by_hand}")
-
-
-def refresh_lists(manager: str, prefix: tuple[str, ...]) -> None:
-    """Read apt's package lists anew; they may be old or absent, and a failing mirror may pass."""
-    if manager == "apt-get":
-        run_logged((*prefix, "apt-get", "update"), "reading package lists", dict(os.environ))
-
-
-def install_packages(manager: str, prefix: tuple[str, ...], packages: list[str]) -> bool:
-    """Install `packages`, the output in the log; return whether that went well."""
-    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    command = (*prefix, *INSTALL_COMMANDS[manager], *packages)
-    return run_logged(command, "installing system packages", environment) == 0
+def list_missing() -> list[str]:
+    """List what this system lacks to install the project and to render."""
+    linux = sys.platform == "linux"
+    renders = linux and os.environ.get("MUJOCO_GL", "egl") == "egl"
+    # LeRobot needs evdev, which is published as source alone.
+    builds = linux and not any(VENV.glob(f"lib/python{MINOR}/site-packages/evdev/__init__.py"))
+    has_compiler = shutil.which("cc") or shutil.which("gcc")
+    missing = {
+        VENV_MODULE: find_spec("ensurepip") is None,
+        RENDERING: renders and not all(map(is_loadable, ("libEGL.so.1", "libGL.so.1"))),
+        COMPILER: builds and not (has_compiler and Path("/usr/include/linux/input.h").exists()),
+        HEADERS: builds and not Path(sysconfig.get_path("include"), "Python.h").exists(),
+    }
+    return [name for name, is_missing in missing.items() if is_missing]
 
 
 def has_browser() -> bool:
@@ -197,143 +184,106 @@ def list_missing_test_tools() -> list[str]:
     return missing + [tool for tool in ("certutil", "npm") if not shutil.which(tool)]
 
 
-def bring_test_tools() -> None:
-    """Install what tests of pages need, where that may be; else say what to run, and go on.
-
-    It never fails: without these tools the tests of pages skip, and say so at the end.
-    """
-    if not (missing := list_missing_test_tools()):
-        return
-    manager, prefix = find_manager(), find_root_prefix()
-    packages = TEST_PACKAGES[manager] if manager else {}
-    if manager and prefix is not None:
-        with hold_lock():
-            names = [packages[tool] for tool in list_missing_test_tools()]
-            if names:
-                say(f"Installing for the tests: {' '.join(names)} (XOP_NO_SYSTEM=1 forbids it)")
-                refresh_lists(manager, prefix)
-            for name in names:  # each by itself: one that has no package keeps nothing else out
-                install_packages(manager, prefix, [name])
-        if not (missing := list_missing_test_tools()):
-            return
-    if not manager:
-        ways = "Install with the system's package manager"
-    else:
-        names = [packages[tool] for tool in missing]
-        ways = f"Run:\n  sudo {' '.join((*INSTALL_COMMANDS[manager], *names))}"
-    if "Chromium" in missing:
-        ways += f"\nor, for Chromium:\n  {PYTHON} -m playwright install --with-deps chromium"
-    verb = "is" if len(missing) == 1 else "are"
-    *others, last = missing
-    named = f"{', '.join(others)} and {last}" if others else last
-    say(f"{named} {verb} missing: tests of pages will skip. {ways}")
+def find_manager() -> str | None:
+    """Return the system's package manager, None where it is none that is known here."""
+    return next(filter(shutil.which, INSTALL_COMMANDS), None)
 
 
-def say(line: str) -> None:
-    """Print one line at once."""
-    print(line, flush=True)
+def find_root_prefix() -> tuple[str, ...] | None:
+    """Return what makes a command run as root without a question, None where that may not be."""
+    if os.environ.get("XOP_NO_SYSTEM", "0") == "1":
+        return None
+    if os.geteuid() == 0:
+        return ()
+    return ("sudo", "-n") if ask("sudo", "-n", "true") is not None else None
 
 
-def read_tail() -> str:
-    """Return the last lines of the log."""
-    lines = LOG.read_text(errors="replace").splitlines() if LOG.exists() else []
-    return "\n".join(f"  | {line}" for line in lines[-TAIL_LINES:])
-
-
-def describe_line(line: str) -> str | None:
-    """Return what a line of pip's output means to a person, None for nothing."""
-    words = line.split()
-    if line.startswith(("Collecting ", "Installing build dependencies")):
-        return " ".join(words[:2]).lower()
-    if line.strip().startswith("Downloading "):
-        name = words[1].rsplit("/", 1)[-1].split("-", 1)[0]
-        return f"downloading {name} {' '.join(words[2:])}"
-    if line.startswith("Installing collected packages"):
-        return f"unpacking {line.count(',') + 1} packages"
-    return None
-
-
-def run_logged(command: tuple[str, ...], doing: str, environment: dict[str, str]) -> int:
-    """Run `command`, its output in the log, and show on one line how far it is.
+def bring(list_missing: Callable[[], list[str]]) -> list[str]:
+    """Install what `list_missing` names where that may be; errors of the package manager show.
 
     Returns:
-        Its exit status.
+        What is missing still.
     """
-    lines: queue.Queue[str | None] = queue.Queue()
-    begun = said = time.monotonic()
-    terminal = sys.stdout.isatty()
-    with (
-        LOG.open("a") as log,
-        subprocess.Popen(
-            command,
-            cwd=ROOT,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-        ) as process,
-    ):
-        log.write(f"$ {' '.join(command)}\n")
-        assert process.stdout is not None
-        thread = threading.Thread(target=_pump, args=(process.stdout, lines), daemon=True)
-        thread.start()
-        try:
-            while (line := _next_line(lines)) is not None:
-                if line:
-                    log.write(line)
-                    log.flush()
-                    doing = describe_line(line) or doing
-                now = time.monotonic()
-                if terminal:
-                    print(f"\r\033[K  {now - begun:4.0f} s  {doing}"[:100], end="", flush=True)
-                elif now - said >= HEARTBEAT_S:
-                    say(f"  {now - begun:4.0f} s  {doing}")
-                    said = now
-        except BaseException:
-            process.terminate()
-            raise
-    if terminal:
-        print("\r\033[K", end="", flush=True)
-    return process.returncode
+    missing, manager = list_missing(), find_manager()
+    if not missing or manager is None or (prefix := find_root_prefix()) is None:
+        return missing
+    packages = list_packages(missing, manager)
+    say(f"Installing {' '.join(packages)} (XOP_NO_SYSTEM=1 forbids it)")
+    if manager == "apt-get":  # its lists may be old or absent
+        run_as_root(prefix, "apt-get update")
+    for some in packages:  # each by itself: one without a package keeps nothing else out
+        run_as_root(prefix, f"{INSTALL_COMMANDS[manager]} {some}")
+    return list_missing()
 
 
-def _pump(stream: Iterator[str], lines: queue.Queue[str | None]) -> None:
-    for line in stream:
-        lines.put(line)
-    lines.put(None)
+def list_packages(missing: list[str], manager: str) -> list[str]:
+    """List what `manager` is to install for each thing that is missing."""
+    return [PACKAGES[name][manager] for name in missing if manager in PACKAGES[name]]
 
 
-def _next_line(lines: queue.Queue[str | None]) -> str | None:
-    """Return the next line, "" after a second without one, None at the end."""
-    try:
-        return lines.get(timeout=1.0)
-    except queue.Empty:
-        return ""
+def run_as_root(prefix: tuple[str, ...], command: str) -> None:
+    """Run a command of the package manager; only what it says of errors shows."""
+    subprocess.run(
+        [*prefix, *command.split()],
+        env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        check=False,
+    )
 
 
-def make_clean_environment() -> dict[str, str]:
-    """Return the environment less what would lead pip to another Python's packages."""
-    return {
-        key: value
-        for key, value in os.environ.items()
-        if key not in {"PYTHONPATH", "PYTHONHOME", "PIP_TARGET", "PIP_PREFIX", "PIP_USER"}
-    }
+def describe_missing(missing: list[str], consequence: str = "") -> str:
+    """Say what is missing, what follows, and the command that brings it."""
+    *others, last = missing
+    named = f"{', '.join(others)} and {last} are" if others else f"{last} is"
+    manager = find_manager()
+    way = "Install with the system's package manager"
+    if manager is not None:
+        packages = " ".join(list_packages(missing, manager))
+        way = f"Run:\n  sudo {INSTALL_COMMANDS[manager]} {packages}"
+    return f"{named} missing{consequence}. {way}"
+
+
+def bring_test_tools() -> None:
+    """Install what tests of pages need, where that may be; else say what to run, and go on."""
+    if not list_missing_test_tools():
+        return
+    with hold_lock():
+        missing = bring(list_missing_test_tools)
+    if missing:
+        say(describe_missing(missing, ": tests of pages will skip"))
+    if "Chromium" in missing:
+        say(f"or, for Chromium:\n  {PYTHON} -m playwright install --with-deps chromium")
+
+
+# -- the environment ----------------------------------------------------------------------------
+
+
+def make_uv_environment(pip_settings: str) -> dict[str, str]:
+    """Return the environment with pip's settings in uv's words: uv doesn't read pip's files.
+
+    Args:
+        pip_settings: What `pip config list` prints.
+    """
+    environment = make_clean_environment()
+    settings = dict(line.split("=", 1) for line in pip_settings.splitlines() if "=" in line)
+    for section in (":env:.", "install.", "global."):  # the first has precedence
+        for option, name in UV_SETTINGS.items():
+            words = ast.literal_eval(settings.get(section + option, "''")).split()
+            # pip passes over a folder that doesn't exist, uv doesn't.
+            words = [word for word in words if not word.startswith("/") or Path(word).exists()]
+            if words:
+                separator = "," if option == "find-links" else " "
+                environment.setdefault(name, separator.join(words))
+    if "UV_INDEX" in environment:  # pip takes the best version of all indexes, uv the first index
+        environment.setdefault("UV_INDEX_STRATEGY", "unsafe-best-match")
+    return environment
 
 
 def is_venv_usable() -> bool:
     """Whether `.venv` is of this interpreter's version and its pip runs."""
-    try:
-        asked = subprocess.run(
-            [PYTHON, "-I", "-c", "import pip, sys; print(sys.version_info[:3])"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-    except OSError:
-        return False
-    return asked.stdout.strip() == str(tuple(sys.version_info[:3]))
+    version = ask(PYTHON, "-I", "-c", "import pip, sys; print(sys.version_info[:3])")
+    return version == f"{tuple(sys.version_info[:3])}\n"
 
 
 def make_venv() -> None:
@@ -350,25 +300,33 @@ def make_venv() -> None:
     free_gb = shutil.disk_usage(ROOT).free / 1e9
     if free_gb < NEEDED_GB:
         raise SetupError(f"{ROOT} has {free_gb:.1f} GB free; the set-up needs {NEEDED_GB:.0f} GB.")
-    made = subprocess.run(
-        [sys.executable, "-I", "-m", "venv", VENV], capture_output=True, text=True, check=False
-    )
-    if made.returncode != 0:
-        raise SetupError(f"python -m venv failed:\n{made.stdout}{made.stderr}")
+    run(sys.executable, "-I", "-m", "venv", VENV)
 
 
-def run_pip(*arguments: str) -> None:
-    """Run the `.venv`'s pip.
+def install_project() -> None:
+    """Install the project and what it needs, at the lock's versions and hashes.
+
+    By uv; by pip where no uv can be had, or where `XOP_INSTALLER=pip` asks for it.
 
     Raises:
-        SetupError: If it fails; carries the end of its output.
+        SetupError: If that fails.
     """
-    options = ["--no-input"] + ["--progress-bar=off"] * (arguments[0] == "install")
-    command = (str(PYTHON), "-I", "-m", "pip", *arguments, *options)
-    if run_logged(command, "starting pip", make_clean_environment()) != 0:
-        raise SetupError(
-            f"pip failed:\n{read_tail()}\nThe whole log is {LOG}. Run the same command again "
-            "after mending it; what is installed already stays."
+    pip = (PYTHON, "-I", "-m", "pip", "--disable-pip-version-check")
+    try:
+        if os.environ.get("XOP_INSTALLER") == "pip":
+            raise SetupError("pip was asked for")
+        (pin,) = re.findall(r"^uv==.*(?:\n +--hash.*)*", LOCK_FILE.read_text(), re.MULTILINE)
+        (VENV / "uv.txt").write_text(pin)
+        run(*pip, "install", "--quiet", "--requirement", VENV / "uv.txt")
+    except SetupError:
+        say("pip installs, as there is no uv; it takes longer.")
+        run(*pip, "install", "--requirement", LOCK_FILE)
+        run(*pip, "install", "--no-deps", "--no-build-isolation", "--editable", ROOT)
+    else:
+        run(
+            *(VENV / "bin" / "uv", "pip", "install", "--python", PYTHON),
+            *("--compile-bytecode", "--constraints", LOCK_FILE, "--editable", f"{ROOT}[dev]"),
+            environment=make_uv_environment(ask(*pip, "config", "list") or ""),
         )
 
 
@@ -391,7 +349,7 @@ def check_rendering() -> None:
     if rendered.returncode != 0:
         fault = (rendered.stderr.strip().splitlines() or ["no message"])[-1]
         manager = find_manager() or "apt-get"
-        command = " ".join((*INSTALL_COMMANDS[manager], *GL_PACKAGES[manager]))
+        command = f"{INSTALL_COMMANDS[manager]} {PACKAGES[RENDERING][manager]}"
         raise SetupError(
             f"MuJoCo can't render with MUJOCO_GL={backend}: {fault}\nTry: sudo {command}\n"
             "or go on without cameras: MUJOCO_GL=disabled"
@@ -404,11 +362,8 @@ def drop_unloadable_torchcodec() -> None:
     LeRobot then decodes videos with PyAV, as it would anyhow, but without a hundred lines of
     tracebacks at each start.
     """
-    loaded = subprocess.run(
-        [PYTHON, "-I", "-c", "import torchcodec"], capture_output=True, check=False
-    )
-    if loaded.returncode != 0:
-        run_pip("uninstall", "--yes", UNLOADABLE)
+    if ask(PYTHON, "-I", "-c", "import torchcodec") is None:
+        run(PYTHON, "-I", "-m", "pip", "uninstall", "--quiet", "--yes", "torchcodec")
 
 
 @contextmanager
@@ -444,36 +399,14 @@ def install_all() -> None:
     first = not is_venv_usable()
     say(
         f"Setting up xop-lerobot in .venv with Python {version} ({sys.executable})."
-        + (" The first time takes 3 to 6 minutes and 6.4 GB." if first else "")
+        + (" The first time takes 1 to 4 minutes and 7 GB." if first else "")
     )
+    if missing := bring(list_missing):
+        raise SetupError(describe_missing(missing))
     make_venv()
-    LOG.write_text("")
-    gl, compiler = lacks_gl(), lacks_compiler()
-    if gl or compiler:
-        install_system_packages(gl, compiler)
-    run_pip("install", PIP)
-    run_pip("install", "-c", str(LOCK_FILE), "-e", f"{ROOT}[dev]")
+    install_project()
     drop_unloadable_torchcodec()
     check_rendering()
-
-
-def write_lock() -> None:
-    """Write the installed versions to `requirements.lock`, below its opening comment."""
-    skipped = [f"--exclude={name}" for name in (DISTRIBUTION, "pip", "wheel")]
-    frozen = subprocess.run(
-        [PYTHON, "-I", "-m", "pip", "freeze", "--exclude-editable", *skipped],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    before = LOCK_FILE.read_text().splitlines()
-    comment = [line for line in before if line.startswith("#")]
-    pins = [line for line in frozen.splitlines() if "==" in line]
-    if not any(line.startswith(f"{UNLOADABLE}==") for line in pins):
-        pins += [line for line in before if line.startswith(f"{UNLOADABLE}==")]
-    pins.sort(key=str.lower)
-    LOCK_FILE.write_text("\n".join([*comment, *pins, ""]))
-    say(f"{LOCK_FILE}: {len(pins)} versions")
 
 
 def main() -> int:
@@ -481,11 +414,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--stamp", help="what setup.sh computed from the files that matter")
     parser.add_argument("--test-tools", action="store_true", help="bring what tests need beside")
-    parser.add_argument("--write-lock", action="store_true", help="freeze .venv's versions")
     arguments = parser.parse_args()
-    if arguments.write_lock:
-        write_lock()
-        return 0
     if arguments.test_tools:
         bring_test_tools()
         return 0

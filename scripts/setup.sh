@@ -8,6 +8,7 @@
 # docs/start/setup.md says what is done and why.
 set -eu
 cd "$(dirname "$0")/.."
+home=${HOME:-/root}
 
 # Anything that changes what has to be installed, and where: a moved checkout breaks its .venv.
 stamp() {
@@ -15,65 +16,54 @@ stamp() {
         { sha256sum 2>/dev/null || cksum; } | cut -d ' ' -f 1
 }
 
-# Print "3.12.1" when $1 runs and is a version that the locked packages are built for.
+# Print "3.12.1" when $1 runs.
 version_of() {
     "$1" -I -S -c 'import sys; print("%d.%d.%d" % sys.version_info[:3])' 2>/dev/null || true
 }
 fits() {
     case "$1" in 3.12.* | 3.13.*) return 0 ;; *) return 1 ;; esac
 }
-
-# Every interpreter worth a look, the tested 3.12 before 3.13, one a line. A pyenv shim exists
-# for versions that it then refuses to run, so the versions' own folders are looked at as well.
-candidates() {
-    home=${HOME:-/root}
-    for minor in 3.12 3.13; do
-        command -v "python$minor" || true
-        for root in "${PYENV_ROOT:-$home/.pyenv}" "$home/.pyenv" /opt/pyenv; do
-            ls -d "$root/versions/$minor".*/bin/python3 2>/dev/null || true
-        done
-        ls -d "${UV_PYTHON_INSTALL_DIR:-$home/.local/share/uv/python}/cpython-$minor".*/bin/python3 \
-            2>/dev/null || true
-        for folder in /usr/bin /usr/local/bin /opt/homebrew/bin "/opt/python$minor/bin"; do
-            ls -d "$folder/python$minor" 2>/dev/null || true
-        done
-        for uv in uv "$home/.local/bin/uv" "$home/.cargo/bin/uv"; do
-            if command -v "$uv" >/dev/null 2>&1; then
-                "$uv" python find --no-python-downloads "$minor" 2>/dev/null || true
-            fi
-        done
-    done
-    command -v python3 || true
-    command -v python || true
-    for root in "${CONDA_PREFIX:-}" "$home/miniforge3" "$home/miniconda3" "$home/anaconda3" /opt/conda; do
-        if [ -n "$root" ]; then
-            ls -d "$root/bin/python3" "$root"/envs/*/bin/python3 2>/dev/null || true
-        fi
-    done
-}
-
 can_make_environments() {
     "$1" -I -c 'import ensurepip, venv, ssl, ctypes' >/dev/null 2>&1
 }
 
-# Debian and Ubuntu keep `venv` in a package of its own; install it for $1 where that may be.
-install_venv_module() {
-    package=python$(version_of "$1" | cut -d . -f 1,2)-venv
-    [ "${XOP_NO_SYSTEM:-0}" != 1 ] && command -v apt-get >/dev/null || return 1
-    sudo=
-    if [ "$(id -u)" != 0 ]; then
-        sudo -n true 2>/dev/null || return 1
-        sudo="sudo -n"
-    fi
-    echo "Installing the system package $package (XOP_NO_SYSTEM=1 forbids it)." >&2
-    { $sudo apt-get update && $sudo apt-get install -y --no-install-recommends "$package"; } \
-        >/dev/null 2>&1
-    can_make_environments "$1"
+# Every interpreter worth a look, the tested 3.12 before 3.13, one a line. A pyenv shim exists
+# for versions that it then refuses to run, so the versions' own folders are looked at as well.
+candidates() {
+    for minor in 3.12 3.13; do
+        command -v "python$minor" || true
+        ls -d "${PYENV_ROOT:-$home/.pyenv}/versions/$minor".*/bin/python3 \
+            "/opt/pyenv/versions/$minor".*/bin/python3 \
+            "${UV_PYTHON_INSTALL_DIR:-$home/.local/share/uv/python}/cpython-$minor".*/bin/python3 \
+            "/usr/bin/python$minor" "/usr/local/bin/python$minor" \
+            "/opt/homebrew/bin/python$minor" "/opt/python$minor/bin/python$minor" \
+            2>/dev/null || true
+    done
+    command -v python3 || true
+    command -v python || true
+    for root in "${CONDA_PREFIX:-/opt/conda}" "$home/miniforge3" "$home/miniconda3" \
+        "$home/anaconda3" /opt/conda; do
+        ls -d "$root/bin/python3" "$root"/envs/*/bin/python3 2>/dev/null || true
+    done
+}
+
+# Let uv download a Python: the uv on the path, or one that an older or newer Python's pip brings.
+download_python() {
+    folder=$(mktemp -d) || return 1
+    uv=$(command -v uv || ls "$home/.local/bin/uv" 2>/dev/null || true)
+    if [ -z "$uv" ]; then
+        uv=$folder/bin/uv
+        python3 -m venv "$folder" >&2 && "$folder/bin/python" -m pip install --quiet uv >&2
+    fi && echo "Python 3.12 is brought by uv." >&2 && "$uv" python install --no-bin 3.12 >&2 &&
+        python=$("$uv" python find --managed-python 3.12)
+    status=$?
+    rm -rf "$folder"
+    return $status
 }
 
 no_python() {
     {
-        echo "xop-lerobot needs Python 3.12 or 3.13, and none was found."
+        echo "xop-lerobot needs Python 3.12 or 3.13, and none was found or could be downloaded."
         echo "Looked at:"
         printf '%s' "${1:-  (no Python at all)
 }"
@@ -109,29 +99,17 @@ find_python() {
         unset IFS
         case "$seen" in *"  $path: "*) continue ;; esac
         version=$(version_of "$path")
-        if ! fits "$version"; then
-            seen="$seen  $path: ${version:-does not run}
-"
-        elif ! can_make_environments "$path"; then
-            seen="$seen  $path: $version, but it cannot make environments
-"
-            without_venv=${without_venv:-$path}
-        else
+        if fits "$version"; then
             python=$path
-            return
+            can_make_environments "$path" && return
+            without_venv=${without_venv:-$path}
         fi
-    done
-    if [ -n "$without_venv" ] && install_venv_module "$without_venv"; then
-        python=$without_venv
-        return
-    fi
-    if [ -n "$without_venv" ]; then
-        without_venv=$(version_of "$without_venv")
-        minor=$(echo "$without_venv" | cut -d . -f 1,2)
-        seen="$seen  (sudo apt-get install python$minor-venv makes Python $without_venv usable)
+        seen="$seen  $path: ${version:-does not run}
 "
-    fi
-    no_python "$seen"
+    done
+    # setup.py brings the package that Debian and Ubuntu keep `venv` in, or names it.
+    python=$without_venv
+    [ -n "$python" ] || download_python || no_python "$seen"
 }
 
 if [ "${1:-}" = --print-python ]; then

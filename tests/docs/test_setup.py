@@ -34,7 +34,6 @@ def setup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.setattr(module, "VENV", tmp_path / ".venv")
     monkeypatch.setattr(module, "PYTHON", tmp_path / ".venv" / "bin" / "python")
     monkeypatch.setattr(module, "STAMP", tmp_path / ".venv" / ".xop-stamp")
-    monkeypatch.setattr(module, "LOG", tmp_path / "setup.log")
     return module
 
 
@@ -71,7 +70,7 @@ def run_shell(
     tools = checkout / "tools"
     if not tools.exists():
         tools.mkdir()
-        for name in ("cat", "cut", "sha256sum", "ls", "dirname", "sh"):
+        for name in ("cat", "cut", "sha256sum", "ls", "dirname", "sh", "mktemp", "rm"):
             found = shutil.which(name)
             assert found is not None
             (tools / name).symlink_to(found)
@@ -148,19 +147,51 @@ def test_no_python_that_fits_is_told_with_what_there_is(checkout: Path) -> None:
     new = write_python(checkout / "bin" / "python", "3.14.0")
     failed = run_shell(checkout, path=str(checkout / "bin"))
     assert failed.returncode == 1
-    assert "xop-lerobot needs Python 3.12 or 3.13, and none was found." in failed.stderr
+    assert (
+        "xop-lerobot needs Python 3.12 or 3.13, and none was found or could be downloaded."
+        in failed.stderr
+    )
     assert f"  {old}: 3.11.2\n  {new}: 3.14.0\n" in failed.stderr
     assert "  uv python install 3.12 " in failed.stderr
     assert "  pyenv install 3.12\n" in failed.stderr
 
 
 @needs_bare_system
-def test_a_python_without_venv_names_the_package(checkout: Path) -> None:
-    write_python(checkout / "bin" / "python3", "3.12.3", can_make=False)
-    failed = run_shell(checkout, path=str(checkout / "bin"))
-    assert failed.returncode == 1
-    assert "3.12.3, but it cannot make environments" in failed.stderr
-    assert "(sudo apt-get install python3.12-venv makes Python 3.12.3 usable)" in failed.stderr
+@pytest.mark.parametrize("at_hand", [True, False], ids=["uv at hand", "uv by another Python's pip"])
+def test_where_none_fits_uv_brings_one(checkout: Path, at_hand: bool) -> None:
+    brought = write_python(checkout / "brought" / "python3.12", "3.12.9")
+    uv = checkout / ("bin" if at_hand else "index") / "uv"
+    old = write_python(checkout / "bin" / "python3", "3.10.12")
+    uv.parent.mkdir(exist_ok=True)
+    uv.write_text(f'#!/bin/sh\ncase "$*" in "python find "*) echo "{brought}" ;; esac\n')
+    uv.chmod(0o755)
+    old.write_text(
+        f'{old.read_text()}[ "$1 $2" = "-m venv" ] && /bin/mkdir "$3/bin" &&\n'
+        f'  echo "/bin/cp {uv} $3/bin" > "$3/bin/python" && /bin/chmod +x "$3/bin/python"\n'
+    )
+    found = run_shell(checkout, "--print-python", path=str(old.parent))
+    assert found.stdout == f"{brought}\n", found.stderr
+
+
+@needs_bare_system
+def test_a_python_without_venv_is_the_last_choice(checkout: Path) -> None:
+    bare = write_python(checkout / "bin" / "python3.12", "3.12.3", can_make=False)
+    search = ("--print-python",)
+    assert run_shell(checkout, *search, path=str(bare.parent)).stdout == f"{bare}\n"
+    whole = write_python(checkout / "home/miniforge3/bin/python3", "3.13.2")
+    assert run_shell(checkout, *search, path=str(bare.parent)).stdout == f"{whole}\n"
+
+
+def test_a_python_without_venv_names_the_package(
+    setup: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(setup, "find_manager", lambda: "apt-get")
+    monkeypatch.setattr(setup, "find_spec", lambda name: None)
+    missing = setup.list_missing()
+    assert missing[0] == "Python's venv"
+    package = f"python3.{sys.version_info.minor}-venv"
+    command = f"sudo apt-get install -y --no-install-recommends {package}"
+    assert command in setup.describe_missing(missing)
 
 
 def test_a_chosen_python_that_does_not_fit_is_an_error(checkout: Path) -> None:
@@ -249,32 +280,29 @@ def test_what_may_not_be_installed_is_told_as_a_command(
 ) -> None:
     monkeypatch.setenv("XOP_NO_SYSTEM", "1")
     monkeypatch.setattr(setup, "find_manager", lambda: manager)
+    monkeypatch.setattr(setup, "list_missing", lambda: [setup.RENDERING])
     with pytest.raises(setup.SetupError) as raised:
-        setup.install_system_packages(gl=True, compiler=False)
+        setup.install_all()
     message = str(raised.value)
-    assert "software rendering (Mesa's EGL) is missing and may not be installed here" in message
+    assert message.startswith("software rendering (Mesa's EGL) is missing. Run:\n  sudo ")
     assert f"sudo {manager} " in message
-    assert message.endswith(" ".join(setup.GL_PACKAGES[manager]))
+    assert message.endswith(setup.PACKAGES[setup.RENDERING][manager])
 
 
 def test_a_failing_package_manager_shows_its_words(
-    setup: ModuleType, monkeypatch: pytest.MonkeyPatch
+    setup: ModuleType, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(setup, "find_manager", lambda: "dnf")
-    monkeypatch.setattr(setup, "find_root_prefix", lambda: ("sh", "-c", "echo no mirror; exit 3"))
-    with pytest.raises(setup.SetupError, match="the package manager failed:\n(.|\n)*no mirror"):
-        setup.install_system_packages(gl=True, compiler=True)
+    monkeypatch.setattr(setup, "find_root_prefix", lambda: ("sh", "-c", "echo no mirror >&2"))
+    assert setup.bring(lambda: [setup.COMPILER]) == [setup.COMPILER]
+    assert "no mirror" in capfd.readouterr().err
 
 
-def test_a_failing_pip_shows_the_end_of_its_output(
-    setup: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(setup, "PYTHON", Path(sys.executable))
-    with pytest.raises(setup.SetupError) as raised:
-        setup.run_pip("install", "--no-index", "no_such_distribution_xop")
-    assert "No matching distribution found for no_such_distribution_xop" in str(raised.value)
-    assert "$ " in setup.LOG.read_text()
-    del capsys
+def test_a_failing_pip_shows_its_output(setup: ModuleType, capfd: pytest.CaptureFixture) -> None:
+    name = "no_such_distribution_xop"
+    with pytest.raises(setup.SetupError, match=f"failed:\n.* install --no-index {name}\n"):
+        setup.run(sys.executable, "-m", "pip", "install", "--no-index", name)
+    assert f"No matching distribution found for {name}" in capfd.readouterr().err
 
 
 # -- what the tests of pages need -----------------------------------------------------------
@@ -299,7 +327,7 @@ def apt(setup: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> P
     script.write_text(
         "#!/bin/sh\n"
         f'echo "$*" >> "{tmp_path}/asked"\n'
-        f'[ -f "{tmp_path}/shelf" ] || {{ echo "no mirror answers"; exit 100; }}\n'
+        f'[ -f "{tmp_path}/shelf" ] || {{ echo "no mirror answers" >&2; exit 100; }}\n'
         'case "$*" in update) exit 0 ;; esac\n'
         'for package in "$@"; do :; done\n'
         f'while read -r line; do [ "$line" = "$package" ] && found=1; done < "{tmp_path}/shelf"\n'
@@ -335,9 +363,7 @@ def test_what_the_tests_of_pages_need_is_installed_once(
     packages = ("chromium", "libnss3-tools", "npm")
     assert get_asked(apt) == ["update", *(f"{install} {name}" for name in packages)]
     told = capsys.readouterr().out
-    assert told == (
-        "Installing for the tests: chromium libnss3-tools npm (XOP_NO_SYSTEM=1 forbids it)\n"
-    )
+    assert told == ("Installing chromium libnss3-tools npm (XOP_NO_SYSTEM=1 forbids it)\n")
     # The next time there is nothing to do, and nothing is asked or said.
     assert run_setup(setup, monkeypatch, "--test-tools") == 0
     assert len(get_asked(apt)) == 4
@@ -363,15 +389,15 @@ def test_a_system_without_chromium_still_gets_the_rest(
 
 
 def test_without_a_mirror_the_tests_run_all_the_same(
-    setup: ModuleType, apt: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    setup: ModuleType, apt: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
 ) -> None:
     assert run_setup(setup, monkeypatch, "--test-tools") == 0
-    told = capsys.readouterr().out
+    told, errors = capfd.readouterr()
     assert "Chromium, certutil and npm are missing: tests of pages will skip. Run:\n" in told
     assert (
         "\n  sudo apt-get install -y --no-install-recommends chromium libnss3-tools npm\n" in told
     )
-    assert "no mirror answers" in setup.LOG.read_text()
+    assert "no mirror answers" in errors
 
 
 @pytest.mark.parametrize("manager", ["apt-get", "dnf", "pacman", "zypper", None])
@@ -391,7 +417,7 @@ def test_tools_that_may_not_be_installed_are_told_as_a_command(
     if manager is None:
         assert "Install with the system's package manager\n" in told
     else:
-        names = " ".join(setup.TEST_PACKAGES[manager].values())
+        names = " ".join(setup.PACKAGES[tool][manager] for tool in ("Chromium", "certutil", "npm"))
         assert f"  sudo {manager} " in told and f" {names}\n" in told
 
 
@@ -399,7 +425,9 @@ def test_the_tests_and_the_set_up_look_for_the_same_browsers(setup: ModuleType) 
     from browser import NAMES
 
     assert setup.BROWSERS == NAMES
-    assert list(setup.TEST_PACKAGES) == list(setup.INSTALL_COMMANDS)
+    for name, packages in setup.PACKAGES.items():
+        managers = ["apt-get"] if name == setup.VENV_MODULE else list(setup.INSTALL_COMMANDS)
+        assert list(packages) == managers, name
 
 
 def test_make_test_brings_the_tools_before_it_tests() -> None:
@@ -450,34 +478,52 @@ def test_torchcodec_stays_where_it_loads(
     setup.PYTHON.write_text(f"#!/bin/sh\nexit {0 if loads else 1}\n")
     setup.PYTHON.chmod(0o755)
     calls: list[tuple[str, ...]] = []
-    monkeypatch.setattr(setup, "run_pip", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(setup, "run", lambda *arguments: calls.append(arguments[4:]))
     setup.drop_unloadable_torchcodec()
-    assert calls == ([] if loads else [("uninstall", "--yes", "torchcodec")])
+    assert calls == ([] if loads else [("uninstall", "--quiet", "--yes", "torchcodec")])
 
 
-@pytest.mark.parametrize("installed", [True, False])
-def test_the_lock_keeps_the_pin_of_what_was_dropped(
-    setup: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, installed: bool
+@pytest.mark.parametrize("has_uv", [True, False])
+def test_pip_installs_where_there_is_no_uv(
+    setup: ModuleType, monkeypatch: pytest.MonkeyPatch, has_uv: bool
 ) -> None:
-    lock = tmp_path / "requirements.lock"
-    lock.write_text("# A comment.\nnumpy==1.0\ntorchcodec==0.1\ngone==3.0\n")
-    monkeypatch.setattr(setup, "LOCK_FILE", lock)
-    frozen = "numpy==2.0\n" + ("torchcodec==0.2\n" if installed else "") + "Zarr==1.0\n"
-    setup.PYTHON.parent.mkdir(parents=True)
-    setup.PYTHON.write_text(f"#!/bin/sh\nprintf '{frozen}'\n")
-    setup.PYTHON.chmod(0o755)
-    setup.write_lock()
-    codec = "torchcodec==0.2" if installed else "torchcodec==0.1"
-    assert lock.read_text() == f"# A comment.\nnumpy==2.0\n{codec}\nZarr==1.0\n"
+    setup.VENV.mkdir()
+    calls = []
+
+    def run(*command: object, environment: object = None) -> None:
+        calls.append(" ".join(Path(str(word)).name for word in command))
+        if calls[-1].endswith("uv.txt") and not has_uv:
+            raise setup.SetupError("no such distribution")
+
+    monkeypatch.setattr(setup, "run", run)
+    setup.install_project()
+    by_uv, by_pip = "uv pip install --python", "--requirement requirements.lock"
+    assert (by_uv in calls[1], by_pip in calls[1]) == (has_uv, not has_uv)
+    assert re.findall(r"^.*==", (setup.VENV / "uv.txt").read_text(), re.M) == ["uv=="]
 
 
-def test_pip_lines_are_told_in_plain_words(setup: ModuleType) -> None:
-    describe = setup.describe_line
-    assert describe("Collecting torch<2.12.0 (from lerobot)\n") == "collecting torch<2.12.0"
-    line = "  Downloading torch-2.11.0-cp312-cp312-manylinux_2_28_x86_64.whl (530.1 MB)\n"
-    assert describe(line) == "downloading torch (530.1 MB)"
-    assert describe("Installing collected packages: a, b, c\n") == "unpacking 3 packages"
-    assert describe("Requirement already satisfied: six\n") is None
+def test_uv_is_told_what_pip_is_set_to(
+    setup: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    names = {*setup.UV_SETTINGS.values(), "UV_INDEX_STRATEGY"}
+    for name in names:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("UV_HTTP_TIMEOUT", "7")
+    settings = f"""\
+:env:.index-url='file:///chosen'
+:env:.find-links='/nowhere {tmp_path} file:///files'
+global.extra-index-url='\\nfile:///a\\nfile:///b'
+global.index-url='file:///global'
+global.timeout='180'
+"""
+    environment = setup.make_uv_environment(settings)
+    assert {name: environment[name] for name in names if name in environment} == {
+        "UV_DEFAULT_INDEX": "file:///chosen",
+        "UV_FIND_LINKS": f"{tmp_path},file:///files",
+        "UV_INDEX": "file:///a file:///b",
+        "UV_INDEX_STRATEGY": "unsafe-best-match",
+        "UV_HTTP_TIMEOUT": "7",
+    }
 
 
 def test_pip_sees_nothing_of_another_python(
@@ -490,14 +536,24 @@ def test_pip_sees_nothing_of_another_python(
     assert environment["PATH"] == os.environ["PATH"]
 
 
+def read_lock() -> str:
+    return (ROOT / "requirements.lock").read_text()
+
+
 def test_the_lock_pins_every_dependency_and_no_broken_mujoco() -> None:
-    lines = (ROOT / "requirements.lock").read_text().splitlines()
-    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    pins = dict(re.findall(r"^([a-z0-9-]+)==([^ ]+)", read_lock(), re.M))
     assert {"mujoco", "lerobot", "mink", "daqp", "torch", "accelerate"} <= set(pins)
-    assert {"pytest", "pytest-xdist"} <= set(pins)
+    assert {"pytest", "pytest-xdist", "uv"} <= set(pins)
     assert pins["lerobot"] == "0.6.1"
     assert int(pins["mujoco"].split(".")[0]) < 4, "4.0.0 has a wrong sparse Newton Hessian"
     assert not any("xop" in name for name in pins)
+
+
+def test_the_lock_has_a_hash_of_each_and_no_address() -> None:
+    _comment, *entries = re.split(r"^(?=[a-z0-9])", read_lock(), flags=re.M)
+    assert len(entries) > 100
+    assert not [entry for entry in entries if "==" not in entry or "--hash=sha256:" not in entry]
+    assert "://" not in read_lock()
 
 
 def test_make_help_names_every_verb() -> None:
