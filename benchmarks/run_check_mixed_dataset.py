@@ -32,7 +32,6 @@ RUNS: tuple[tuple[str, str], ...] = (
     ("session", "retarget --out {out} --robot rby1 --method direct --episodes 0 --workers 1"),
     ("session", "repair --out {out}"),
     ("killed", "repair --out {out}"),
-    ("killed_stock", "repair --out {out}"),
 )
 """Of which dataset, and the verb with its flags."""
 

@@ -1,4 +1,4 @@
-"""Make a small dataset of mixed episodes and two killed sessions, to try `xop-curate` on.
+"""Make a small dataset of mixed episodes and a killed session, to try `xop-curate` on.
 
     .venv/bin/python -m benchmarks.run_make_mixed_dataset --out outputs/mixed
 
@@ -10,7 +10,6 @@ that 30 episodes take about a minute. The same seed makes the same episodes.
     OUT/session        the episodes, as `xop-record` writes them
     OUT/kinds.json     what each of them is: success, failure, fall, tracking_loss, idle_start, …
     OUT/killed         a session of `xop-record`, killed (`kill -9`) in the middle of an episode
-    OUT/killed_stock   the same with LeRobot's own recorder: parquet files without an end
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from tqdm import tqdm
@@ -285,43 +284,6 @@ def make_killed(root: Path, seed: int, size: tuple[int, int]) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def make_killed_stock(source: Path, root: Path) -> None:
-    """Record the episodes of `source` anew with LeRobot's own class, and kill this process."""
-    from lerobot.configs.video import RGBEncoderConfig
-    from lerobot.datasets import LeRobotDataset
-    from lerobot.utils.constants import DEFAULT_FEATURES
-
-    from xop_lerobot.recording.columns import is_own_column
-
-    frames = LeRobotDataset(f"local/{source.name}", root=source)
-    features = {
-        key: {name: spec[name] for name in ("dtype", "shape", "names")}
-        for key, spec in frames.meta.features.items()
-        if key not in DEFAULT_FEATURES and not is_own_column(key)
-    }
-    copy = LeRobotDataset.create(
-        f"local/{root.name}",
-        FPS,
-        features,
-        root=root,
-        robot_type=frames.meta.robot_type,
-        rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="ultrafast"),
-    )
-    for row in range(frames.num_frames):
-        item: dict[str, Any] = cast("dict[str, Any]", frames[row])
-        episode, frame = int(item["episode_index"]), int(item["frame_index"])
-        if frame == 0 and row:
-            copy.save_episode()
-        if episode == KILLED_EPISODES and frame == 20:
-            break
-        values = {key: np.asarray(item[key]) for key in features}
-        for key, spec in features.items():
-            if spec["dtype"] == "video":
-                values[key] = np.round(values[key] * 255).astype(np.uint8).transpose(1, 2, 0)
-        copy.add_frame({**values, "task": item["task"]})
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 def main() -> int:
     """Make it all; returns the exit code."""
     parser = argparse.ArgumentParser(
@@ -332,7 +294,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="seed of all that is random")
     parser.add_argument("--width", type=int, default=48, help="of a picture [pixel]")
     parser.add_argument("--height", type=int, default=36, help="of a picture [pixel]")
-    parser.add_argument("--only-session", action="store_true", help="leave the killed ones out")
+    parser.add_argument("--only-session", action="store_true", help="leave the killed one out")
     args = parser.parse_args()
     try:
         make_all(args)
@@ -342,7 +304,7 @@ def main() -> int:
 
 
 def make_all(args: argparse.Namespace) -> None:
-    """Make the whole session, then let two more be killed.
+    """Make the whole session, then another one that is killed.
 
     Raises:
         BadValue: If there are too few episodes, or the directory holds something.
@@ -360,7 +322,6 @@ def make_all(args: argparse.Namespace) -> None:
     (args.out / "kinds.json").write_text(json.dumps(kinds) + "\n", encoding="utf-8")
     if not args.only_session:
         run(make_killed, args.out / "killed", args.seed + 1, size, expected=-signal.SIGKILL)
-        run(make_killed_stock, session, args.out / "killed_stock", expected=-signal.SIGKILL)
 
 
 def run(target: Callable[..., None], *arguments: Any, expected: int = 0) -> None:

@@ -1,13 +1,14 @@
 """Restore a recording that was cut off, to its last whole episode.
 
-A recorder that is killed, or a disk that is full, leaves files without their end and metadata that
-is missing or does not fit. Every episode of which all rows and pictures are there is kept; what is
-lost is said, with the reason. Nothing is guessed: rows that were not written yet are gone.
+A recorder that is killed, a full disk, or a copy that broke off leaves metadata that is missing or
+does not fit. Every episode of which all rows and images are there is kept; what is lost is said,
+with the reason. Nothing is guessed: rows that were not written yet are gone.
 
     xop-curate repair --root outputs/killed --out outputs/restored
 
 Recordings of `xop-record`, and those of `lerobot-record` with this project's robots, load after a
-kill as they are; this cleans up behind them. Those of LeRobot's own robots do not.
+kill as they are; this cleans up behind them. LeRobot's own recorder leaves Parquet files without a
+footer, whose rows cannot be read.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """What is left of a recording that was cut off, laid out so that it can be read as a dataset.
 
-LeRobot's recorder keeps the files of its rows and of its metadata open until a session ends. When
-it is killed before, the rows lack their end, which can be made anew (`salvage`), and the metadata
-of the last episodes is lost, which the rows and the pictures tell too. What of an episode was
-still in memory is gone.
+A killed recorder, a full disk or a copy that broke off leaves metadata that is missing or does not
+fit, which rows and images tell too. Rows come from Parquet files with a footer: what a file without
+one holds cannot be read.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ from xop_lerobot.curate.entries import (
 )
 from xop_lerobot.curate.order_check import OrderCheck
 from xop_lerobot.curate.row_files import make_rows, make_schema
-from xop_lerobot.curate.salvage import CannotSalvage, salvage
 from xop_lerobot.curate.source import Source
 from xop_lerobot.curate.task_words import TASKS_FILE, has_index_of_words, read_tasks
 from xop_lerobot.curate.video import VideoIndex, index_video
@@ -68,10 +66,11 @@ def lay_out(root: Path, folder: Path) -> Wreck:
     """Lay out in `folder` what is readable of the dataset `root`, which is not changed.
 
     Raises:
-        BadDataset: If `meta/info.json` is not readable.
+        BadDataset: If `meta/info.json` is not readable, or a file of rows is not while no metadata
+            says which episodes are lost with it.
     """
     with Source(root) as source:
-        info, features = source.info, source.features
+        info = source.info
     wreck = Wreck(root, source)
     (folder / "meta").mkdir(parents=True)
     for name in (Path("meta") / "info.json", TASKS_FILE):
@@ -81,8 +80,17 @@ def lay_out(root: Path, folder: Path) -> Wreck:
         shutil.copytree(root / FACTS_DIR, folder / FACTS_DIR)
     if (root / "videos").is_dir():
         (folder / "videos").symlink_to((root / "videos").resolve())
-    rows = dict(_lay_out_rows(wreck, features, folder))
+    unreadable: list[str] = []
+    rows = dict(_lay_out_rows(wreck, unreadable, folder))
     known = _read_known(wreck, info, folder)
+    if unreadable and not known:
+        raise BadDataset(
+            root,
+            f"{'; '.join(unreadable)}, and {EPISODES_DIR} does not say which episodes are in it. "
+            "LeRobot's own recorder leaves Parquet files without a footer when it is killed, an "
+            "unfinished copy too: copy the file again, or move it out of the dataset and repair "
+            "the rest",
+        )
     wreck.source = Source(folder)
     _find_whole(wreck, rows, known, _find_tasks(wreck, rows, known, folder))
     _note_strays(wreck, info)
@@ -91,42 +99,35 @@ def lay_out(root: Path, folder: Path) -> Wreck:
 
 
 def _lay_out_rows(
-    wreck: Wreck, features: dict[str, Any], folder: Path
+    wreck: Wreck, unreadable: list[str], folder: Path
 ) -> Iterator[tuple[int, tuple[Path, pa.Table]]]:
-    """Make every data file readable, and yield file and counters of each episode by its index."""
-    schema = make_schema(features)
+    """Yield file and counters of each episode by its index; list the files that cannot be."""
     for path in sorted((wreck.root / "data").glob("*/*.parquet")):
         name = path.relative_to(wreck.root)
-        target = folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            table = _read_counters(path)
-            target.symlink_to(path.resolve())
-        except _UNREADABLE:
-            try:
-                count = salvage(path, schema, target)
-                table = _read_counters(target)
-            except (CannotSalvage, *_UNREADABLE) as fault:
-                wreck.notes.append(f"{name} is not readable ({_first_line(fault)}): left out")
-                target.unlink(missing_ok=True)
-                continue
-            wreck.notes.append(f"{name} was cut off: {count} episodes' rows in it are whole")
-        except CannotSalvage as fault:
-            wreck.notes.append(f"{name} is not usable ({fault}): left out")
+            table = _read_counters(wreck.root, name)
+        except _UNREADABLE as error:
+            unreadable.append(f"{name} is not readable ({_first_line(error)})")
+            wreck.notes.append(f"{unreadable[-1]}: left out")
             continue
+        except BadDataset as error:
+            wreck.notes.append(f"{error.fault}: left out")
+            continue
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).symlink_to(path.resolve())
         counters = table["episode_index"].to_numpy()
         for index in table["episode_index"].unique().to_pylist():
             yield index, (name, table.filter(pa.array(counters == index)))
 
 
-def _read_counters(path: Path) -> pa.Table:
-    with pq.ParquetFile(path) as file:
+def _read_counters(root: Path, name: Path) -> pa.Table:
+    with pq.ParquetFile(root / name) as file:
         names = file.schema_arrow.names
-        missing = [name for name in _COUNTERS if name not in names]
+        missing = [column for column in _COUNTERS if column not in names]
         if missing:
-            raise CannotSalvage(f"it has no column {', '.join(missing)}")
+            raise BadDataset(root, f"{name} has no column {', '.join(missing)}")
         table = file.read(columns=list(_COUNTERS), use_threads=False)
-    return table.cast(pa.schema([(name, pa.int64()) for name in table.column_names]))
+    return table.cast(pa.schema([(column, pa.int64()) for column in _COUNTERS]))
 
 
 def _read_known(wreck: Wreck, info: dict[str, Any], folder: Path) -> dict[int, EpisodeEntry]:
