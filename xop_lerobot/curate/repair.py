@@ -30,7 +30,7 @@ from xop_lerobot.curate.arguments import (
 
 if TYPE_CHECKING:
     from xop_lerobot.curate.clip import Clip
-    from xop_lerobot.curate.wreck import Wreck
+    from xop_lerobot.curate.damaged import DamagedDataset
 
 SUMMARY = "restore a recording that was cut off"
 
@@ -43,40 +43,40 @@ def add_arguments(parser: CommandParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Repair a dataset; returns the exit code."""
+    from xop_lerobot.curate.damaged import reconstruct  # noqa: PLC0415 torch
     from xop_lerobot.curate.transfer import Step, transfer  # noqa: PLC0415 torch
-    from xop_lerobot.curate.wreck import lay_out  # noqa: PLC0415 torch
 
     root: Path = arguments.root
     destination = make_destination(arguments, root)
     if destination is None:
         with tempfile.TemporaryDirectory() as folder:
-            report(lay_out(root, Path(folder) / "wreck"))
+            report(reconstruct(root, Path(folder) / "damaged"))
         return 0
     with destination as draft:
-        wreck = lay_out(root, draft.with_name("wreck"))
-        report(wreck)
+        damaged = reconstruct(root, draft.with_name("damaged"))
+        report(damaged)
         step = dataclasses.replace(Step.now("repair"), root=root)
-        transfer(_make_clips(wreck, quiet=arguments.quiet), draft, step)
+        transfer(_make_clips(damaged, quiet=arguments.quiet), draft, step)
     print(f"written to {destination.root}")
     return 0
 
 
-def _make_clips(wreck: Wreck, *, quiet: bool) -> Iterator[Clip]:
+def _make_clips(damaged: DamagedDataset, *, quiet: bool) -> Iterator[Clip]:
     from xop_lerobot.curate.clip import Clip  # noqa: PLC0415
 
-    total = len(wreck.entries)
-    for entry in show_progress(wreck.entries, total, "episode", quiet=quiet):
-        yield Clip(wreck.source, entry)
+    total = len(damaged.entries)
+    for entry in show_progress(damaged.entries, total, "episode", quiet=quiet):
+        yield Clip(damaged.source, entry)
 
 
-def report(wreck: Wreck) -> None:
+def report(damaged: DamagedDataset) -> None:
     """Print what was found, what is kept and what is lost."""
-    for note in wreck.notes:
+    for note in damaged.notes:
         print(note)
-    for index, reason in sorted(wreck.lost.items()):
+    for index, reason in sorted(damaged.lost.items()):
         print(f"episode {index} is lost: {reason}")
-    if not wreck.notes and not wreck.lost:
+    if not damaged.notes and not damaged.lost:
         print("nothing is wrong with it")
-    frames = sum(entry.length for entry in wreck.entries)
-    whole = f"{say_count(len(wreck.entries), 'episode')}, {say_count(frames, 'frame')}"
-    print(f"whole: {whole}. Lost: {len(wreck.lost)}")
+    frames = sum(entry.length for entry in damaged.entries)
+    whole = f"{say_count(len(damaged.entries), 'episode')}, {say_count(frames, 'frame')}"
+    print(f"whole: {whole}. Lost: {len(damaged.lost)}")

@@ -44,7 +44,7 @@ _UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError)
 
 
 @dataclass
-class Wreck:
+class DamagedDataset:
     """What is left of a dataset.
 
     Attributes:
@@ -62,7 +62,7 @@ class Wreck:
     notes: list[str] = field(default_factory=list)
 
 
-def lay_out(root: Path, folder: Path) -> Wreck:
+def reconstruct(root: Path, folder: Path) -> DamagedDataset:
     """Lay out in `folder` what is readable of the dataset `root`, which is not changed.
 
     Raises:
@@ -71,7 +71,7 @@ def lay_out(root: Path, folder: Path) -> Wreck:
     """
     with Source(root) as source:
         info = source.info
-    wreck = Wreck(root, source)
+    damaged = DamagedDataset(root, source)
     (folder / "meta").mkdir(parents=True)
     for name in (Path("meta") / "info.json", TASKS_FILE):
         if (root / name).is_file():
@@ -81,8 +81,8 @@ def lay_out(root: Path, folder: Path) -> Wreck:
     if (root / "videos").is_dir():
         (folder / "videos").symlink_to((root / "videos").resolve())
     unreadable: list[str] = []
-    rows = dict(_lay_out_rows(wreck, unreadable, folder))
-    known = _read_known(wreck, info, folder)
+    rows = dict(_lay_out_rows(damaged, unreadable, folder))
+    known = _read_known(damaged, info, folder)
     if unreadable and not known:
         raise BadDataset(
             root,
@@ -91,27 +91,27 @@ def lay_out(root: Path, folder: Path) -> Wreck:
             "unfinished copy too: copy the file again, or move it out of the dataset and repair "
             "the rest",
         )
-    wreck.source = Source(folder)
-    _find_whole(wreck, rows, known, _find_tasks(wreck, rows, known, folder))
-    _note_strays(wreck, info)
-    wreck.notes[:] = dict.fromkeys(wreck.notes)  # a fault may be that of two episodes
-    return wreck
+    damaged.source = Source(folder)
+    _find_whole(damaged, rows, known, _find_tasks(damaged, rows, known, folder))
+    _note_strays(damaged, info)
+    damaged.notes[:] = dict.fromkeys(damaged.notes)  # a fault may be that of two episodes
+    return damaged
 
 
 def _lay_out_rows(
-    wreck: Wreck, unreadable: list[str], folder: Path
+    damaged: DamagedDataset, unreadable: list[str], folder: Path
 ) -> Iterator[tuple[int, tuple[Path, pa.Table]]]:
     """Yield file and counters of each episode by its index; list the files that cannot be."""
-    for path in sorted((wreck.root / "data").glob("*/*.parquet")):
-        name = path.relative_to(wreck.root)
+    for path in sorted((damaged.root / "data").glob("*/*.parquet")):
+        name = path.relative_to(damaged.root)
         try:
-            table = _read_counters(wreck.root, name)
+            table = _read_counters(damaged.root, name)
         except _UNREADABLE as error:
             unreadable.append(f"{name} is not readable ({_first_line(error)})")
-            wreck.notes.append(f"{unreadable[-1]}: left out")
+            damaged.notes.append(f"{unreadable[-1]}: left out")
             continue
         except BadDataset as error:
-            wreck.notes.append(f"{error.fault}: left out")
+            damaged.notes.append(f"{error.fault}: left out")
             continue
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).symlink_to(path.resolve())
@@ -130,34 +130,36 @@ def _read_counters(root: Path, name: Path) -> pa.Table:
     return table.cast(pa.schema([(column, pa.int64()) for column in _COUNTERS]))
 
 
-def _read_known(wreck: Wreck, info: dict[str, Any], folder: Path) -> dict[int, EpisodeEntry]:
+def _read_known(
+    damaged: DamagedDataset, info: dict[str, Any], folder: Path
+) -> dict[int, EpisodeEntry]:
     """Read the metadata that is readable, and lay it out for the statistics."""
     known: dict[int, EpisodeEntry] = {}
     known_files = 0
-    for path in sorted((wreck.root / EPISODES_DIR).glob("*/*.parquet")):
-        name = path.relative_to(wreck.root)
+    for path in sorted((damaged.root / EPISODES_DIR).glob("*/*.parquet")):
+        name = path.relative_to(damaged.root)
         try:
             with pq.ParquetFile(path) as file:
                 file.read(use_threads=False)
         except _UNREADABLE as error:
-            wreck.notes.append(f"{name} is not readable ({_first_line(error)}): made anew")
+            damaged.notes.append(f"{name} is not readable ({_first_line(error)}): made anew")
             continue
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).symlink_to(path.resolve())
         known_files += 1
     if not known_files:
-        wreck.notes.append(f"{EPISODES_DIR} has nothing readable: made anew of rows and pictures")
+        damaged.notes.append(f"{EPISODES_DIR} has nothing readable: made anew of rows and pictures")
         return known
     try:
-        for entry in read_entries(folder, info, wreck.notes.append):
+        for entry in read_entries(folder, info, damaged.notes.append):
             known[entry.index] = entry
     except BadDataset as error:
-        wreck.notes.append(f"{EPISODES_DIR}: {error.fault}")
+        damaged.notes.append(f"{EPISODES_DIR}: {error.fault}")
     return known
 
 
 def _find_tasks(
-    wreck: Wreck,
+    damaged: DamagedDataset,
     rows: dict[int, tuple[Path, pa.Table]],
     known: dict[int, EpisodeEntry],
     folder: Path,
@@ -166,10 +168,10 @@ def _find_tasks(
     try:
         tasks = read_tasks(folder)
         if not has_index_of_words(folder):
-            wreck.notes.append(f"{TASKS_FILE} has its words where LeRobot does not look: mended")
+            damaged.notes.append(f"{TASKS_FILE} has its words where LeRobot does not look: mended")
         return tasks
     except BadDataset:
-        wreck.notes.append(f"{TASKS_FILE} is not readable: made anew of what the episodes say")
+        damaged.notes.append(f"{TASKS_FILE} is not readable: made anew of what the episodes say")
     tasks: dict[int, str] = {}
     for index, (_, table) in rows.items():
         numbers = table["task_index"].unique().to_pylist()
@@ -187,49 +189,49 @@ def _find_tasks(
 
 
 def _find_whole(
-    wreck: Wreck,
+    damaged: DamagedDataset,
     rows: dict[int, tuple[Path, pa.Table]],
     known: dict[int, EpisodeEntry],
     tasks: dict[int, str],
 ) -> None:
-    source = wreck.source
+    source = damaged.source
     found: list[EpisodeEntry] = []
     for index in sorted(rows.keys() | known.keys()):
         entry = known.get(index)
         if index not in rows:
             is_empty = entry is not None and _count_expected(entry) == 0
-            wreck.lost[index] = "it has no rows" if is_empty else "its rows are gone"
+            damaged.lost[index] = "it has no rows" if is_empty else "its rows are gone"
             continue
         file, table = rows[index]
         frames = table["frame_index"].to_numpy()
         expected = (_count_expected(entry) if entry else 0) or int(frames.max()) + 1
-        whole = _describe(wreck, index, entry, file, table, tasks)
+        whole = _describe(damaged, index, entry, file, table, tasks)
         if not np.array_equal(frames, np.arange(expected)):
-            wreck.lost[index] = f"it has {len(frames)} of {expected} rows"
+            damaged.lost[index] = f"it has {len(frames)} of {expected} rows"
             whole = dataclasses.replace(whole, length=expected)  # so many pictures it has
         elif entry is None and known:
-            wreck.notes.append(f"episode {index} is not in {EPISODES_DIR}: made anew")
+            damaged.notes.append(f"episode {index} is not in {EPISODES_DIR}: made anew")
         elif entry is not None and entry.has_rows and entry.file != file:
-            wreck.notes.append(
+            damaged.notes.append(
                 f"episode {index} is in {file}, and not in {entry.file}, as {EPISODES_DIR} says: "
                 "mended"
             )
         found.append(whole)
-    _note_faults(wreck, known, found)
-    videos, schema = Videos(wreck, known, found), make_schema(source.features)
+    _note_faults(damaged, known, found)
+    videos, schema = Videos(damaged, known, found), make_schema(source.features)
     for entry in found:
-        if entry.index in wreck.lost:
+        if entry.index in damaged.lost:
             continue
         spans = videos.find(entry)
         if isinstance(spans, str):
-            wreck.lost[entry.index] = spans
+            damaged.lost[entry.index] = spans
             continue
         whole = dataclasses.replace(entry, videos=spans, faults=())
         fault = _check_rows(source, whole, schema)
         if fault:
-            wreck.lost[entry.index] = fault
+            damaged.lost[entry.index] = fault
         else:
-            wreck.entries.append(whole)
+            damaged.entries.append(whole)
 
 
 def _count_expected(entry: EpisodeEntry) -> int:
@@ -239,7 +241,7 @@ def _count_expected(entry: EpisodeEntry) -> int:
 
 
 def _describe(
-    wreck: Wreck,
+    damaged: DamagedDataset,
     index: int,
     entry: EpisodeEntry | None,
     file: Path,
@@ -250,7 +252,7 @@ def _describe(
     length = table.num_rows
     if entry is not None:
         return dataclasses.replace(entry, length=length, file=file)
-    facts = FactsFile(wreck.root).read(index)
+    facts = FactsFile(damaged.root).read(index)
     if facts.pop("length", length) != length:
         facts = {}
     facts.pop("episode_index", None)
@@ -264,19 +266,19 @@ def _list_cameras(source: Source) -> list[str]:
 
 
 def _note_faults(
-    wreck: Wreck, known: Mapping[int, EpisodeEntry], found: Sequence[EpisodeEntry]
+    damaged: DamagedDataset, known: Mapping[int, EpisodeEntry], found: Sequence[EpisodeEntry]
 ) -> None:
     """Note what the metadata says wrongly, and what is not numbered as LeRobot takes for granted.
 
     All of it is made and counted anew.
     """
-    check, held = OrderCheck(wreck.source), {entry.index: entry for entry in found}
+    check, held = OrderCheck(damaged.source), {entry.index: entry for entry in found}
     for index, entry in known.items():
         rows = None
-        if index in held and held[index].length == entry.length and index not in wreck.lost:
+        if index in held and held[index].length == entry.length and index not in damaged.lost:
             with suppress(BadDataset):  # which is told when the rows are checked
-                rows = wreck.source.read(held[index], check.columns)
-        wreck.notes += (*entry.faults, *check.check(entry, rows))
+                rows = damaged.source.read(held[index], check.columns)
+        damaged.notes += (*entry.faults, *check.check(entry, rows))
 
 
 def _check_rows(source: Source, entry: EpisodeEntry, schema: pa.Schema) -> str:
@@ -319,19 +321,22 @@ class Videos:
     episodes 3 and 5 is episode 4's, if it is as many as that has rows.
 
     Args:
-        wreck: The dataset.
+        damaged: The dataset.
         known: Episodes whose metadata is there.
         found: Episodes of which there are rows, in order; those that are lost have pictures too.
     """
 
     def __init__(
-        self, wreck: Wreck, known: Mapping[int, EpisodeEntry], found: Sequence[EpisodeEntry]
+        self,
+        damaged: DamagedDataset,
+        known: Mapping[int, EpisodeEntry],
+        found: Sequence[EpisodeEntry],
     ) -> None:
-        self._root, self._fps = wreck.root, wreck.source.fps
-        self._notes = wreck.notes
+        self._root, self._fps = damaged.root, damaged.source.fps
+        self._notes = damaged.notes
         self._cache: dict[Path, VideoIndex | None] = {}
-        self._keys = _list_cameras(wreck.source)
-        shared = wreck.source.video_use.shared
+        self._keys = _list_cameras(damaged.source)
+        shared = damaged.source.video_use.shared
         self._faults: dict[int, str] = {}
         """Why the pictures are not where the metadata says, by the episode's index."""
         for entry in found if self._keys else ():
@@ -339,7 +344,7 @@ class Videos:
                 self._faults[entry.index] = shared[entry.index][0]
             elif entry.videos.keys() != set(self._keys):
                 self._faults[entry.index] = "its pictures are gone"
-            elif entry.index not in wreck.lost:
+            elif entry.index not in damaged.lost:
                 fault = self._check(entry.videos, entry)
                 if fault:
                     self._faults[entry.index] = fault
@@ -456,26 +461,28 @@ class Videos:
         return ""
 
 
-def _note_strays(wreck: Wreck, info: dict[str, Any]) -> None:
+def _note_strays(damaged: DamagedDataset, info: dict[str, Any]) -> None:
     """Note what an episode that was under way has left behind."""
-    root = wreck.root
+    root = damaged.root
     for folder in sorted(root.glob("tmp*")):
         if folder.is_dir():
-            wreck.notes.append(f"{folder.name}/ holds pictures of an unfinished episode: left out")
+            damaged.notes.append(
+                f"{folder.name}/ holds pictures of an unfinished episode: left out"
+            )
     for folder in sorted(itertools.chain(root.glob("images/*/episode*"))):
         count = sum(1 for _ in folder.iterdir())
-        wreck.notes.append(
+        damaged.notes.append(
             f"{folder.relative_to(root)} holds {count} pictures of an unfinished episode: left out"
         )
-    spans = [span for entry in wreck.entries for span in entry.videos.values()]
-    used = wreck.source.video_use.files | {span.file for span in spans}
+    spans = [span for entry in damaged.entries for span in entry.videos.values()]
+    used = damaged.source.video_use.files | {span.file for span in spans}
     for path in sorted(root.glob("videos/*/*/*.mp4")):
         if path.relative_to(root) not in used:
-            wreck.notes.append(f"{path.relative_to(root)} belongs to no episode: left out")
+            damaged.notes.append(f"{path.relative_to(root)} belongs to no episode: left out")
     counted = info.get("total_episodes", 0)
-    there = len(wreck.entries)
+    there = len(damaged.entries)
     if counted != there:
-        wreck.notes.append(
+        damaged.notes.append(
             f"meta/info.json counts {say_count(counted, 'episode')}, {there} are whole"
         )
 
