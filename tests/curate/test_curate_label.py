@@ -14,10 +14,9 @@ from curate_recorded import load, read_rows, record_toy
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.curate.cli import main
 from xop_lerobot.curate.label import FrameRules, list_entries
-from xop_lerobot.curate.label_views import LabelWindow, ask_in_terminal, read_films
+from xop_lerobot.curate.label_by_hand import LabelSession, ask, read_images
 from xop_lerobot.curate.labels import (
     Label,
-    LabelSession,
     list_runs,
     number_frames,
     read_labels,
@@ -204,7 +203,7 @@ def test_session_keeps_every_answer_at_once(tmp_path):
     session = LabelSession([0, 1, 2], path, ["reach", "lift"])
     assert session.progress == "episode 0 (1 of 3)"
     session.press("2 1.5")
-    session.press("1", 0.25)
+    session.press("1 0.25")
     assert session.marks == (("reach", 0.25), ("lift", 1.5))
     session.press("s")
     assert json.loads(path.read_text()) == {
@@ -250,7 +249,7 @@ def filmed(tmp_path_factory):
 def test_by_hand_in_a_terminal(filmed, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", io.StringIO("1 0.2\ns\n\nf\n"))
     path = tmp_path / "labels.json"
-    flags = ["--by-hand", str(path), "--names", "reach,lift", "--view", "terminal"]
+    flags = ["--by-hand", str(path), "--names", "reach,lift"]
     run(filmed, tmp_path / "out", *flags)
     assert [row["success"] for row in read_facts(tmp_path / "out")] == [True, False]
     assert read_rows(tmp_path / "out", 0)["subtask_index"].tolist() == [1] * 5 + [0] * 15
@@ -261,62 +260,16 @@ def test_by_hand_in_a_terminal(filmed, tmp_path, monkeypatch, capsys):
 
 
 def test_end_of_input_stops(filmed, tmp_path):
-    session = LabelSession([0, 1], tmp_path / "labels.json")
     with Source(filmed) as source:
-        entries = list(source.episodes)
-        ask_in_terminal(
-            session,
-            lambda index: read_films(source, entries[index], 3),
-            tmp_path,
-            lambda index: 25,
-            io.StringIO("s\n"),
-        )
-    assert session.labels == {0: Label(True)}
+        labels = ask(source, tmp_path / "labels.json", [], io.StringIO("s\n"))
+    assert labels == {0: Label(True)}
 
 
-def test_by_hand_in_a_window(filmed, tmp_path, monkeypatch):
-    import matplotlib as mpl
-
-    monkeypatch.setattr(mpl, "rcParams", mpl.rcParams.copy())
-    mpl.use("agg")
-    from matplotlib.backend_bases import KeyEvent
-
-    session = LabelSession([0, 1], tmp_path / "labels.json", ["reach"])
+def test_images_of_a_strip(filmed):
     with Source(filmed) as source:
-        entries = list(source.episodes)
-        window = LabelWindow(session, lambda i: read_films(source, entries[i]), 25)
-
-        def press(key: str) -> None:
-            canvas = window.figure.canvas
-            canvas.callbacks.process("key_press_event", KeyEvent("key_press_event", canvas, key))
-
-        window._on_time()
-        assert window.frame == 1
-        press(" ")
-        window._on_time()
-        assert window.frame == 1
-        for key in ("up", "right", "right"):
-            press(key)
-        assert window.frame == 13
-        press("1")
-        assert session.marks == (("reach", 13 / 25),)
-        press("up")
-        assert window.frame == 19
-        press("s")
-        assert (session.current, window.frame) == (1, 0)
-        press("f")
-    assert session.current is None
-    assert session.labels == {0: Label(True, (("reach", 0.52),)), 1: Label(False)}
-    with pytest.raises(BadValue, match=r"^no window can be opened here. Use --view=terminal$"):
-        window.run()
-
-
-def test_films(filmed):
-    with Source(filmed) as source:
-        entry = next(source.episodes)
-        films = read_films(source, entry)
-        assert films["head"].shape == (20, 144, 192, 3)  # three times as large, for the labels
-        assert read_films(source, entry, 4)["head"].shape[0] == 4
+        # Three times as large as they are, for the labels.
+        images = read_images(source, next(source.episodes), 4)
+        assert images["head"].shape == (4, 144, 192, 3)
 
 
 def test_no_pictures_to_show(base, tmp_path, capsys):

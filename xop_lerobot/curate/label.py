@@ -10,8 +10,8 @@ r"""Label episodes with success and sub-tasks, by rule, by hand or from a file.
 --success is an expression over the figures of an episode, as in `filter`; where it is not known,
 the label stays. --subtask is one over what a frame has: each entry of each column by its name with
 `_` for dots (robot_head_z, action_mode_pos), time, left and frame; the first that holds counts.
-By hand, the episodes are shown in a window, or as strips of pictures where there is no display;
-every answer is kept in the file at once, and the next run goes on from there.
+By hand, each episode is a strip of images in a file, and keys in the terminal answer; every answer
+is kept in the file of labels at once, and the next run goes on from there.
 
 Success goes to the facts and to `next.success`. Sub-tasks go to the column `subtask_index`, which
 `meta/subtasks.parquet` names, and to the facts.
@@ -152,9 +152,6 @@ FEATURES: Mapping[str, Mapping[str, Any]] = {
     SUCCESS: {"dtype": "bool", "shape": [1], "names": ["success"]},
     SUBTASK: {"dtype": "int64", "shape": [1], "names": None},
 }
-_VIEWS = ("auto", "window", "terminal")
-_STRIP = 8
-"""Pictures of a strip."""
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -177,13 +174,6 @@ def add_arguments(parser: CommandParser) -> None:
     )
     parser.add_argument(
         "--names", default="", metavar="A,B", help="by hand: sub-tasks, numbered from 1"
-    )
-    parser.add_argument(
-        "--view",
-        choices=_VIEWS,
-        default="auto",
-        help="by hand: window, terminal with strips of pictures beside FILE, or auto (default): "
-        "a window where there is a display",
     )
 
 
@@ -225,8 +215,10 @@ def _make_labeller(arguments: argparse.Namespace, source: Source) -> Labeller:
             raise BadValue(f"there are no labels '{arguments.labels}'")
         return Labeller(source, labels=read_labels(arguments.labels))
     if arguments.by_hand is not None:
+        from xop_lerobot.curate.label_by_hand import ask  # noqa: PLC0415 video
+
         names = [name.strip() for name in arguments.names.split(",") if name.strip()]
-        labels = ask(source, arguments.by_hand, names, arguments.view)
+        labels = ask(source, arguments.by_hand, names)
         return Labeller(source, labels=labels)
     success = Expression(arguments.success, KINDS) if arguments.success else None
     rules = FrameRules(source, arguments.subtask) if arguments.subtask else None
@@ -351,33 +343,3 @@ class Labeller:
             fps = self._source.fps
             times = (f"{name} {count / fps:.2f} s" for name, count in self._frames.items())
             print(f"sub-tasks: {', '.join(times)}")
-
-
-def ask(source: Source, path: Path, names: list[str], view: str = "auto") -> dict[int, Label]:
-    """Ask somebody for labels.
-
-    Args:
-        source: The dataset.
-        path: File of the answers.
-        names: Names of the sub-tasks.
-        view: `window`, `terminal` or `auto`.
-    """
-    from xop_lerobot.curate import label_views  # noqa: PLC0415 matplotlib
-    from xop_lerobot.curate.labels import LabelSession  # noqa: PLC0415
-
-    entries = {entry.index: entry for entry in source.episodes}
-    session = LabelSession(sorted(entries), path, names)
-    if view == "window" or (view == "auto" and label_views.has_display()):
-        window = label_views.LabelWindow(
-            session, lambda index: label_views.read_films(source, entries[index]), source.fps
-        )
-        window.run()
-        return session.labels
-    folder = path.with_name(f"{path.stem}_strips")
-    label_views.ask_in_terminal(
-        session,
-        lambda index: label_views.read_films(source, entries[index], _STRIP),
-        folder,
-        lambda index: _STRIP / (entries[index].length / source.fps),
-    )
-    return session.labels

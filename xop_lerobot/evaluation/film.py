@@ -27,7 +27,7 @@ def choose_moments(count: int, number: int = 8) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(number, count)).round().astype(int))
 
 
-def build_strip(cameras: Mapping[str, np.ndarray], fps: int, number: int = 8) -> np.ndarray:
+def build_strip(cameras: Mapping[str, np.ndarray], fps: float, number: int = 8) -> np.ndarray:
     """Put moments of an episode side by side, one row per camera, with their times.
 
     Args:
@@ -53,7 +53,7 @@ def build_strip(cameras: Mapping[str, np.ndarray], fps: int, number: int = 8) ->
 
 
 def write_strip(
-    path: Path, cameras: Mapping[str, np.ndarray], fps: int, number: int = 8
+    path: Path, cameras: Mapping[str, np.ndarray], fps: float, number: int = 8
 ) -> np.ndarray:
     """Write the strip of `cameras` as an image and return it; arguments as in `build_strip`."""
     strip = build_strip(cameras, fps, number)
