@@ -383,11 +383,11 @@ def test_dry_run_does_nothing(made, tmp_path, capsys):
 
 
 def test_unknown_is_left_out_or_kept(foreign, tmp_path, capsys):
-    flags = ["filter", "--root", str(foreign), "--where", "tracking_p95 < 1 and episode == 0"]
+    flags = ["filter", "--root", str(foreign), "--where", "episode == 0 and tracking_p95 < 1"]
     out = tmp_path / "out"
     assert main([*flags, "--out", str(out)]) == 1
     assert capsys.readouterr().err.endswith(
-        "error: 'tracking_p95 < 1 and episode == 0' holds for none of the 2 episodes: for 1 it is "
+        "error: 'episode == 0 and tracking_p95 < 1' holds for none of the 2 episodes: for 1 it is "
         "not known (tracking_p95 in 1). No dataset is made\n"
     )
     assert not out.exists()

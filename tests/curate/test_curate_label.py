@@ -62,7 +62,7 @@ def test_success_by_rule(base, tmp_path, capsys):
 
 def test_unknown_leaves_the_label(tmp_path, capsys):
     root = make_foreign(tmp_path / "foreign", 2, 10, video=False)
-    run(root, tmp_path / "out", "--success", "tracking_p95 < 0.1 and episode == 0")
+    run(root, tmp_path / "out", "--success", "episode == 0 and tracking_p95 < 0.1")
     assert "success: 0 yes, 1 no, 1 as before" in capsys.readouterr().out
     facts = read_facts(tmp_path / "out")
     assert [row.get("success") for row in facts] == [None, False]

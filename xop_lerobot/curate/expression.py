@@ -1,23 +1,21 @@
-"""Small expressions over an episode's figures: `success and tracking_p95 < 0.1 and not fall`.
+"""Conditions on an episode's figures: `success and tracking_p95 < 0.1 and not fall`.
 
-They look like Python and are checked as a whole, names and kinds included, before any episode is
-read. Nothing but what is listed here can be written: `and or not`, `< <= > >= == !=`, `in`,
-`is None`, `+ - * / %`, `abs min max`, numbers, texts, lists of them, `True False None`.
+They are written like Python, checked as a whole (names and kinds) before any episode is read, and
+evaluated from left to right. Nothing but what is listed here can be written: `and or not`,
+`< <= > >= == !=`, `in`, `is None`, `+ - * / %`, `abs min max`, numbers, texts, lists of them,
+`True False`.
 
-A figure may be unknown (None): the dataset has not the columns for it. Then so is whatever is
-computed or compared with it, and `not`; but `False and x` is false and `True or x` is true
-whatever x is. `x is None` asks whether it is unknown.
+A figure may be missing (None): the dataset has not the columns for it. A condition that comes to
+a missing figure has no result, and its episode is excluded; `x is None` asks whether it is missing.
 """
 
 from __future__ import annotations
 
 import ast
 import difflib
-import math
-import operator
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from enum import Enum
 from typing import Any, NoReturn
 
@@ -33,8 +31,6 @@ class Kind(Enum):
     FLAG = "yes or no"
     NUMBER = "a number"
     TEXT = "a text"
-    LIST = "a list"
-    NONE = "None"
 
 
 class UnknownFigure(UnknownName):
@@ -48,35 +44,27 @@ class UnknownFigure(UnknownName):
             self.args = (f"{head}. Did you mean {near[0]!r}? Known{tail}",)
 
 
-type _Values = Mapping[str, Any]
-type _Code = Callable[[_Values], Any]
+class _Missing(Exception):
+    """A figure that is needed has no value."""
 
-_COMPARISONS: Mapping[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]] = {
-    ast.Lt: ("<", operator.lt),
-    ast.LtE: ("<=", operator.le),
-    ast.Gt: (">", operator.gt),
-    ast.GtE: (">=", operator.ge),
-    ast.Eq: ("==", operator.eq),
-    ast.NotEq: ("!=", operator.ne),
-}
-_ARITHMETIC: Mapping[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
-    ast.Add: ("+", operator.add),
-    ast.Sub: ("-", operator.sub),
-    ast.Mult: ("*", operator.mul),
-    ast.Div: ("/", operator.truediv),
-    ast.Mod: ("%", operator.mod),
-}
-_COMPILERS: Mapping[type[ast.expr], str] = {
-    ast.Constant: "_compile_constant",
-    ast.Name: "_compile_name",
-    ast.BoolOp: "_compile_logic",
-    ast.UnaryOp: "_compile_sign",
-    ast.BinOp: "_compile_arithmetic",
-    ast.Compare: "_compile_comparison",
-    ast.Call: "_compile_call",
-}
-"""What may be written, and which method compiles it."""
-_FUNCTIONS: Mapping[str, Callable[..., Any]] = {"abs": abs, "min": min, "max": max}
+
+class _Figures(dict[str, Any]):
+    """Values by name as Python looks them up: `x` must not be missing, `x?` may be."""
+
+    def __getitem__(self, name: str) -> Any:
+        if name.endswith(_MAY_BE_MISSING):
+            return super().__getitem__(name.removesuffix(_MAY_BE_MISSING))
+        if super().__getitem__(name) is None:
+            raise _Missing(name)
+        return super().__getitem__(name)
+
+
+_MAY_BE_MISSING = "?"
+_KINDS: Mapping[type, Kind] = {
+    bool: Kind.FLAG, int: Kind.NUMBER, float: Kind.NUMBER, str: Kind.TEXT,
+}  # fmt: skip
+_FUNCTIONS: Mapping[str, Any] = {"abs": abs, "min": min, "max": max}
+_GLOBALS = {"__builtins__": _FUNCTIONS}
 
 
 class Expression:
@@ -104,167 +92,116 @@ class Expression:
         try:
             with warnings.catch_warnings(action="ignore"):  # Python's own on what is odd
                 tree = ast.parse(self.text, mode="eval")
-            kind, self._code = self._compile(tree.body)
+                kind = self._check(tree.body)
+                if kind is not Kind.FLAG:
+                    self._refuse(tree.body, f"is {kind.value}, and must be yes or no. Compare it")
+                self._code = compile(tree, "<expression>", "eval")
         except SyntaxError as error:
             self._refuse_syntax(error)
         except (RecursionError, MemoryError, ValueError) as error:
-            if isinstance(error, BadValue):
-                raise
             raise BadValue(f"expression '{self.text[:40]}…' is too deep, or malformed") from error
-        if kind is not Kind.FLAG:
-            self._refuse(tree.body, f"is {kind.value}, and must be yes or no. Compare it")
 
     def evaluate(self, values: Mapping[str, Any]) -> bool | None:
-        """Evaluate the expression on one episode.
+        """Evaluate the expression on one episode, as Python does: from left to right.
 
         Args:
-            values: Value of each name in `names`; None for what is not known.
+            values: Value of each name in `names`; None for what is missing.
 
         Returns:
-            Whether it holds; None if that is not known.
+            Whether it holds; None if it comes to a missing figure, or divides by zero.
         """
-        return self._code(values)
+        try:
+            return eval(self._code, _GLOBALS, _Figures(values))  # nothing but what `_check` lets in
+        except (_Missing, ArithmeticError):
+            return None
 
-    # Each of these returns what a part is and how it is computed.
+    def _check(self, node: ast.expr) -> Kind:
+        """Check that a part is one of those that may be written; return what it is."""
+        match node:
+            case ast.Constant(value=bool() | int() | float() | str() as value):
+                return _KINDS[type(value)]
+            case ast.Name(id=name):
+                if name not in self._kinds:
+                    raise UnknownFigure(name, self._kinds)
+                self.names |= {name}
+                return self._kinds[name]
+            case ast.Compare():
+                return self._check_comparison(node)
+            case ast.BoolOp(values=parts):
+                return self._expect(Kind.FLAG, parts)
+            case ast.UnaryOp(op=ast.Not(), operand=part):
+                return self._expect(Kind.FLAG, [part])
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=part):
+                parts = [part]
+            case ast.BinOp(left=left, op=ast.Add() | ast.Sub() | ast.Mult() | ast.Div() | ast.Mod(),
+                           right=right):  # fmt: skip
+                parts = [left, right]
+            case ast.Call():
+                parts = self._check_call(node)
+            case _:
+                self._refuse(
+                    node,
+                    "cannot be written here. Known: and, or, not (as words), <, <=, >, >=, ==, "
+                    "!=, in (and a list after it), is None, +, -, *, /, %, abs, min, max, "
+                    "numbers and texts",
+                )
+        return self._expect(Kind.NUMBER, parts)
 
-    def _compile(self, node: ast.expr) -> tuple[Kind, _Code]:
-        if isinstance(node, ast.Tuple | ast.List | ast.Set):
-            self._refuse(node, "is a list, which stands only after `in`")
-        name = _COMPILERS.get(type(node))
-        if name is None:
-            self._refuse(
-                node,
-                "cannot be written here. Known: and, or, not, <, <=, >, >=, ==, !=, in, "
-                "is None, +, -, *, /, %, abs, min, max, numbers and texts",
-            )
-        return getattr(self, name)(node)
-
-    def _compile_constant(self, node: ast.Constant) -> tuple[Kind, _Code]:
-        value = node.value
-        if value is None:
-            return Kind.NONE, lambda values: None
-        if isinstance(value, bool):
-            return Kind.FLAG, lambda values: value
-        if isinstance(value, int | float):
-            return Kind.NUMBER, lambda values: value
-        if isinstance(value, str):
-            return Kind.TEXT, lambda values: value
-        self._refuse(node, "is no number and no text")
-
-    def _compile_name(self, node: ast.Name) -> tuple[Kind, _Code]:
-        name = node.id
-        if name not in self._kinds:
-            raise UnknownFigure(name, self._kinds)
-        self.names |= {name}
-        return self._kinds[name], lambda values: values[name]
-
-    def _compile_logic(self, node: ast.BoolOp) -> tuple[Kind, _Code]:
-        parts = [self._expect(part, Kind.FLAG) for part in node.values]
-        decisive = isinstance(node.op, ast.Or)
-
-        def decide(values: _Values) -> bool | None:
-            results = [part(values) for part in parts]
-            if decisive in results:
-                return decisive
-            return None if None in results else not decisive
-
-        return Kind.FLAG, decide
-
-    def _compile_sign(self, node: ast.UnaryOp) -> tuple[Kind, _Code]:
-        if isinstance(node.op, ast.Not):
-            return Kind.FLAG, _lift(operator.not_, self._expect(node.operand, Kind.FLAG))
-        if isinstance(node.op, ast.USub | ast.UAdd):
-            sign = operator.neg if isinstance(node.op, ast.USub) else operator.pos
-            return Kind.NUMBER, _lift(sign, self._expect(node.operand, Kind.NUMBER))
-        self._refuse(node, "has an operator that is not known. Known: not, -")
-
-    def _compile_arithmetic(self, node: ast.BinOp) -> tuple[Kind, _Code]:
-        if type(node.op) not in _ARITHMETIC:
-            hint = " (for 'and' and 'or', write the words)"
-            known = ", ".join(sign for sign, _ in _ARITHMETIC.values())
-            self._refuse(node, f"has an operator that is not known. Known: {known}{hint}")
-        _, function = _ARITHMETIC[type(node.op)]
-        sides = [self._expect(side, Kind.NUMBER) for side in (node.left, node.right)]
-        return Kind.NUMBER, _lift(function, *sides)
-
-    def _compile_call(self, node: ast.Call) -> tuple[Kind, _Code]:
-        name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
+    def _check_call(self, node: ast.Call) -> list[ast.expr]:
+        name, count = ast.unparse(node.func), len(node.args)
         if name not in _FUNCTIONS:
             raise UnknownName("function in an expression", name, _FUNCTIONS)
-        count = len(node.args)
         if node.keywords or count < 1 or (name == "abs") != (count == 1):
             self._refuse(node, f"has {count} arguments. Write abs(x), min(x, y) or max(x, y)")
-        arguments = [self._expect(argument, Kind.NUMBER) for argument in node.args]
-        return Kind.NUMBER, _lift(_FUNCTIONS[name], *arguments)
+        return node.args
 
-    def _compile_comparison(self, node: ast.Compare) -> tuple[Kind, _Code]:
-        links = []
-        left = node.left
-        for sign, right in zip(node.ops, node.comparators, strict=True):
-            links.append(self._compile_link(node, left, sign, right))
-            left = right
+    def _check_comparison(self, node: ast.Compare) -> Kind:
+        kind, right = self._check(node.left), node.comparators[0]
+        match node.ops:
+            case [ast.Is() | ast.IsNot()]:
+                is_none = isinstance(right, ast.Constant) and right.value is None
+                if not is_none or not isinstance(node.left, ast.Name):
+                    self._refuse(node, "has `is`, which asks a figure for None alone")
+                node.left.id += _MAY_BE_MISSING
+            case [ast.In() | ast.NotIn()] if isinstance(right, ast.Tuple | ast.List | ast.Set):
+                self._expect(kind, right.elts)
+            case [ast.In() | ast.NotIn()]:
+                if kind is not Kind.TEXT:
+                    self._refuse(node, "must have a list after `in`, such as (1, 2)")
+                self._expect(kind, [right])
+            case signs:
+                for sign, part in zip(signs, node.comparators, strict=True):
+                    self._check_link(node, kind, sign, part)
+        return Kind.FLAG
 
-        def chain(values: _Values) -> bool | None:
-            results = [link(values) for link in links]
-            return False if False in results else None if None in results else True
-
-        return Kind.FLAG, chain
-
-    def _compile_link(
-        self, node: ast.Compare, left: ast.expr, sign: ast.cmpop, right: ast.expr
-    ) -> _Code:
-        if isinstance(sign, ast.Is | ast.IsNot):
-            if not (isinstance(right, ast.Constant) and right.value is None):
-                self._refuse(node, "has `is`, which asks for None alone. Write == to compare")
-            _, code = self._compile(left)
-            wanted = isinstance(sign, ast.Is)
-            return lambda values: (code(values) is None) == wanted
-        if isinstance(sign, ast.In | ast.NotIn):
-            return self._compile_membership(node, left, sign, right)
-        (first, code), (second, other) = self._compile(left), self._compile(right)
-        text, function = _COMPARISONS[type(sign)]
-        if Kind.NONE in (first, second):
+    def _check_link(self, node: ast.Compare, kind: Kind, sign: ast.cmpop, right: ast.expr) -> None:
+        """Check what is on the right of a sign, where `kind` is on the left."""
+        if isinstance(right, ast.Constant) and right.value is None:
             self._refuse(node, "compares with None. Write `is None` or `is not None`")
-        if first is not second:
+        other = self._check(right)
+        if kind is not other:
             self._refuse(
                 node,
-                f"compares two kinds: '{ast.unparse(left)}' is {first.value}, "
-                f"'{ast.unparse(right)}' is {second.value}",
+                f"compares two kinds: '{self._quote(node.left)}' is {kind.value}, "
+                f"'{self._quote(right)}' is {other.value}",
             )
-        if first is not Kind.NUMBER and not isinstance(sign, ast.Eq | ast.NotEq):
-            self._refuse(node, f"orders by {text} what is no number. Known: ==, !=")
-        return _lift(function, code, other)
+        if not isinstance(sign, ast.Eq | ast.NotEq) and kind is not Kind.NUMBER:
+            self._refuse(node, "orders what is no number. Known: ==, !=")
+        if isinstance(sign, ast.Is | ast.IsNot | ast.In | ast.NotIn):
+            self._refuse(node, "has `in` or `is` in a chain. Write each comparison alone")
 
-    def _compile_membership(
-        self, node: ast.Compare, left: ast.expr, sign: ast.cmpop, right: ast.expr
-    ) -> _Code:
-        kind, code = self._compile(left)
-        if isinstance(right, ast.Tuple | ast.List | ast.Set):
-            others = [self._expect(item, kind) for item in right.elts]
-        elif kind is Kind.TEXT:
-            whole = self._expect(right, Kind.TEXT)
-            found = _lift(lambda part, text: part in text, code, whole)
-            return found if isinstance(sign, ast.In) else _lift(operator.not_, found)
-        else:
-            self._refuse(node, "must have a list after `in`, such as (1, 2)")
+    def _expect(self, expected: Kind, parts: list[ast.expr]) -> Kind:
+        for part in parts:
+            kind = self._check(part)
+            if kind is not expected:
+                self._refuse(part, f"is {kind.value}, and must be {expected.value} there")
+        return expected
 
-        def look(values: _Values) -> bool | None:
-            value, items = code(values), [other(values) for other in others]
-            if value is None:
-                return None
-            return True if value in items else None if None in items else False
-
-        return look if isinstance(sign, ast.In) else _lift(operator.not_, look)
-
-    def _expect(self, node: ast.expr, expected: Kind) -> _Code:
-        kind, code = self._compile(node)
-        if kind is not expected:
-            self._refuse(node, f"is {kind.value}, and must be {expected.value} there")
-        return code
+    def _quote(self, node: ast.expr) -> str:
+        return ast.get_source_segment(self.text, node) or ast.unparse(node)
 
     def _refuse(self, node: ast.expr, fault: str) -> NoReturn:
-        part = ast.unparse(node)
-        raise BadValue(f"expression '{self.text}': '{part}' {fault}")
+        raise BadValue(f"expression '{self.text}': '{self._quote(node)}' {fault}")
 
     def _refuse_syntax(self, error: SyntaxError) -> NoReturn:
         place = f" at character {error.offset}" if error.offset else ""
@@ -276,19 +213,3 @@ class Expression:
         raise BadValue(
             f"expression '{self.text}' is malformed{place}: {error.msg}{hint}"
         ) from error
-
-
-def _lift(function: Callable[..., Any], *parts: _Code) -> _Code:
-    """Make `function` of the parts' values; unknown if one is, or if it has no finite value."""
-
-    def compute(values: _Values) -> Any:
-        arguments = [part(values) for part in parts]
-        if any(argument is None for argument in arguments):
-            return None
-        try:
-            result = function(*arguments)
-        except ArithmeticError:
-            return None
-        return None if isinstance(result, float) and not math.isfinite(result) else result
-
-    return compute

@@ -5,10 +5,9 @@ r"""Keep the episodes for which an expression holds, in a new dataset.
     xop-curate filter --root outputs/week --where "duration > 5 and idle_time < 2" --dry-run
 
 In the expression: and or not, < <= > >= == !=, in, is None, + - * / %, abs min max, numbers,
-'texts', (lists), True False None. A figure may be unknown (None), where the dataset has no columns
-for it; so is then what is compared with it. `False and x` is false and `True or x` true all the
-same, and `x is None` asks. Episodes for which the whole is unknown are left out, unless
---keep-unknown.
+'texts', (lists), True False. A figure may be missing, where the dataset has no columns for it.
+Episodes for which the expression, read from left to right, comes to a missing figure are left out
+and counted, unless --keep-unknown; `x is None` asks whether x is missing.
 """
 
 from __future__ import annotations
@@ -172,7 +171,8 @@ class Filter:
         )
 
     def _describe(self) -> str:
-        return ", ".join(f"{name} in {count}" for name, count in self._missing.items())
+        missing = ", ".join(f"{name} in {count}" for name, count in self._missing.items())
+        return missing or "a division by 0"
 
     def report(self) -> None:
         """Print what was kept."""

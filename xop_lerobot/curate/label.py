@@ -7,11 +7,11 @@ r"""Label episodes with success and sub-tasks, by rule, by hand or from a file.
     xop-curate label --root outputs/week --out outputs/labelled \
         --by-hand labels.json --names reach,lift
 
---success is an expression over the figures of an episode, as in `filter`; where it is not known,
-the label stays. --subtask is one over what a frame has: each entry of each column by its name with
-`_` for dots (robot_head_z, action_mode_pos), time, left and frame; the first that holds counts.
-By hand, each episode is a strip of images in a file, and keys in the terminal answer; every answer
-is kept in the file of labels at once, and the next run goes on from there.
+--success is an expression over the figures of an episode, as in `filter`; where it comes to a
+missing one, the label stays. --subtask is one over what a frame has: each entry of each column by
+its name with `_` for dots (robot_head_z, action_mode_pos), time, left and frame; the first that
+holds counts. By hand, each episode is a strip of images in a file, and keys in the terminal answer;
+every answer is kept in the file of labels at once, and the next run goes on from there.
 
 Success goes to the facts and to `next.success`. Sub-tasks go to the column `subtask_index`, which
 `meta/subtasks.parquet` names, and to the facts.
