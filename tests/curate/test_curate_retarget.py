@@ -22,13 +22,13 @@ import xop_lerobot.collect.run as run_module
 from xop_lerobot.collect.merge import merge_attempts
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.state import FRAMES
+from xop_lerobot.curate.arguments import parse_episodes
 from xop_lerobot.curate.cli import main
 from xop_lerobot.curate.retarget import RetargetFolder
 from xop_lerobot.curate.retarget_job import (
     RetargetConfig,
     RetargetJob,
     choose_fps,
-    parse_episodes,
     read_settings,
     read_weights,
 )
@@ -342,7 +342,7 @@ def test_nothing_that_can_be_replayed(source, tmp_path, capsys):
     ("flags", "code", "message"),
     [
         (["--episodes=1,7"], 1, "it has no episode 7 (it has 3, 0 to 2)"),
-        (["--episodes=one"], 2, "--episodes must be such as 0,3,8-11, got 'one'"),
+        (["--episodes=one"], 2, "--episodes must be such as 0,3,8-11 or 0,3,8:12, got 'one'"),
         (["--retargeter", "colour=2"], 2, "unknown setting of the retargeter 'colour'. Known: bod"),
         (["--retargeter", "horizon=x"], 2, "setting of the retargeter 'horizon': Couldn't parse"),
         (["--weights", "position"], 2, "weight must be given as KEY=VALUE, got 'position'"),
@@ -437,6 +437,9 @@ def test_settings_are_read_by_their_type():
 
 def test_choices():
     assert parse_episodes("8-11, 3,9") == [3, 8, 9, 10, 11]
+    assert parse_episodes("8:11,9-12,3") == [3, 8, 9, 10, 11, 12]
+    with pytest.raises(BadValue, match="--episodes has '11-8', which names none, in '3,11-8'"):
+        parse_episodes("3,11-8")
     assert [choose_fps(0, fps) for fps in (25, 50, 30, 12.5, 10)] == [25, 50, 25, 25, 10]
     assert choose_fps(5, 30) == 5
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -88,6 +89,31 @@ def make_destination(
         raise BadValue(f"say where the new dataset goes: {choices}, or --dry-run")
     destination = Destination(out, source, *others)
     return None if arguments.dry_run else destination
+
+
+_SPAN = re.compile(r"(\d+)(?:(-|:)(\d+))?")
+
+
+def parse_episodes(text: str) -> list[int]:
+    """Read a choice of episodes: `0,3,8-11` with 11, or `0,3,8:12` without 12, as in Python.
+
+    Returns:
+        Their indices, in ascending order and without repetition.
+
+    Raises:
+        BadValue: If it is none.
+    """
+    chosen: set[int] = set()
+    for part in text.split(","):
+        span = _SPAN.fullmatch(part.strip())
+        if span is None:
+            raise BadValue(f"--episodes must be such as 0,3,8-11 or 0,3,8:12, got '{text}'")
+        first, sign, last = span.groups()
+        named = range(int(first), int(last or first) + (sign != ":"))
+        if not named:
+            raise BadValue(f"--episodes has '{part.strip()}', which names none, in '{text}'")
+        chosen.update(named)
+    return sorted(chosen)
 
 
 def show_progress[T](

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from xop_lerobot.core.command_line import CommandParser, say_count
 from xop_lerobot.core.errors import BadDataset, BadValue
-from xop_lerobot.curate.arguments import add_source, show_progress
+from xop_lerobot.curate.arguments import add_source, parse_episodes, show_progress
 from xop_lerobot.curate.source import Source
 
 SUMMARY = "write one HTML page: figures, plots, pictures and timelines of the episodes"
@@ -71,7 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
         value = given[name]
         if value < least:
             raise BadValue(f"--{name} must be {least} or more, got {value}")
-    wanted = None if arguments.episodes is None else _parse(arguments.episodes)
+    chosen = arguments.episodes
+    wanted = None if chosen is None else set(parse_episodes(chosen))
     page = find_page(arguments)
     with Source(arguments.root) as source:
         count = count_episodes(source, wanted)
@@ -106,12 +107,6 @@ def run(arguments: argparse.Namespace) -> int:
         )
     print(f"written to {page}, {page.stat().st_size / 1e6:.1f} MB")
     return 1 if faults or report.faulty else 0
-
-
-def _parse(text: str) -> set[int]:
-    from xop_lerobot.curate.retarget_job import parse_episodes  # noqa: PLC0415
-
-    return set(parse_episodes(text))
 
 
 def find_page(arguments: argparse.Namespace) -> Path | None:

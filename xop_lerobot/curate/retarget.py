@@ -28,7 +28,7 @@ from xop_lerobot.collect.run import Collection, run_collection
 from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, say_count
 from xop_lerobot.core.errors import BadDataset, BadValue, XopError
 from xop_lerobot.core.folders import FolderTaken, write_whole
-from xop_lerobot.curate.arguments import add_source
+from xop_lerobot.curate.arguments import add_source, parse_episodes
 from xop_lerobot.curate.clip import PROVENANCE, Step, name_source
 from xop_lerobot.curate.retarget_job import (
     DEFAULT_FPS,
@@ -36,7 +36,6 @@ from xop_lerobot.curate.retarget_job import (
     RetargetConfig,
     RetargetJob,
     choose_fps,
-    parse_episodes,
     read_settings,
     read_weights,
 )

@@ -101,21 +101,6 @@ class Operators:
         return self._names
 
 
-def parse_episodes(text: str) -> list[int]:
-    """Read a choice of episodes such as `0,3,8-11`.
-
-    Raises:
-        BadValue: If it is none.
-    """
-    chosen: list[int] = []
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        if not first.isdecimal() or (dash and not last.isdecimal()):
-            raise BadValue(f"--episodes must be such as 0,3,8-11, got '{text}'")
-        chosen.extend(range(int(first), int(last or first) + 1))
-    return sorted(set(chosen))
-
-
 DEVICE = "retarget"
 """Name of the device that plays the recorded operators."""
 DEFAULT_FPS = 25

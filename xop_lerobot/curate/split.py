@@ -23,6 +23,7 @@ from xop_lerobot.curate.arguments import (
     add_destination,
     add_source,
     make_destination,
+    parse_episodes,
     show_progress,
 )
 from xop_lerobot.curate.source import Source
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 SUMMARY = "split a dataset into several"
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-_FORM = "NAME=FRACTION or NAME=EPISODES, such as train=0.8 or val=0,3,10:20"
+_FORM = "NAME=FRACTION or NAME=EPISODES, such as train=0.8, val=0,3,8-11 or val=0,3,8:12"
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -112,28 +113,18 @@ def parse_parts(texts: Sequence[str]) -> dict[str, float | list[int]]:
 
 
 def _parse_share(text: str, share: str) -> float | list[int]:
+    if "." not in share:
+        try:
+            return parse_episodes(share)
+        except BadValue:
+            raise BadValue(f"--parts takes {_FORM}, got '{text}'") from None
     try:
-        if "." in share:
-            fraction = float(share)
-            if not 0 < fraction <= 1:
-                raise BadValue(f"a fraction must be above 0 and at most 1, got '{text}'")
-            return fraction
-        return parse_indices(share)
+        fraction = float(share)
     except ValueError:
         raise BadValue(f"--parts takes {_FORM}, got '{text}'") from None
-
-
-def parse_indices(text: str) -> list[int]:
-    """Read a list such as `0,3,10:20`, where 20 is not in.
-
-    Raises:
-        ValueError: If it is malformed.
-    """
-    indices: list[int] = []
-    for piece in text.split(","):
-        start, colon, stop = piece.partition(":")
-        indices += range(int(start), int(stop)) if colon else [int(start)]
-    return indices
+    if not 0 < fraction <= 1:
+        raise BadValue(f"a fraction must be above 0 and at most 1, got '{text}'")
+    return fraction
 
 
 def format_indices(indices: Sequence[int]) -> str:
