@@ -170,7 +170,7 @@ def show(demos: list[Demo], roots: list[Path], out: Path) -> None:
         films.write_gif(base.with_suffix(".gif"), films.build_film(cameras, FPS), FPS)
         print(f"{demo.robot}: dataset {_shorten(root)}", end="")
         print(f", pictures {_shorten(base)}.png, .mp4 and .gif")
-    print(f"\n{summary.format_table(summaries)}")
+    print(f"\n{summary.format_summaries(summaries)}")
 
 
 def _shorten(path: Path) -> str:

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from curate_data import make_synthetic, rewrite
 
-from xop_lerobot.core.command_line import can_print_anything, make_output_readable
+from xop_lerobot.core.command_line import can_print_anything, format_table, make_output_readable
 from xop_lerobot.curate import cli as curate
 from xop_lerobot.curate.cli import VERBS
 from xop_lerobot.curate.task_words import TASKS_FILE
@@ -38,6 +38,17 @@ class Terminal:
         sys.stderr.flush()
         out, err = (stream.getvalue().decode(self._encoding) for stream in self._streams)
         return out, err
+
+
+def test_tables_align_numbers_right_and_words_left():
+    rows = [("reach", "3/20", "1.5 ± 0.2", ""), ("walk on", "11/20", "-", "1 lost")]
+    assert format_table(("task", "success", "CT [s]", "note"), rows).splitlines() == [
+        "task     success     CT [s]  note",
+        "-------  -------  ---------  ------",
+        "reach       3/20  1.5 ± 0.2",
+        "walk on    11/20          -  1 lost",
+    ]
+    assert format_table(("task", "n"), []).splitlines() == ["task  n", "----  -"]
 
 
 @pytest.fixture(scope="module")

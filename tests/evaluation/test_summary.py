@@ -108,7 +108,7 @@ def test_an_episode_that_never_planned_takes_no_time() -> None:
 
 
 def test_the_table_is_aligned_and_has_units() -> None:
-    lines = summary.format_table([compute(make_columns())] * 2).splitlines()
+    lines = summary.format_summaries([compute(make_columns())] * 2).splitlines()
     assert len(lines) == 4
     assert len({len(line) for line in lines}) == 1
     assert "duration [s]" in lines[0] and "plan p99 [ms]" in lines[0]

@@ -1,4 +1,4 @@
-"""What the commands of this project share: a parser with the project's errors, readable output.
+"""What the commands of this project share: a parser with its errors, readable output, tables.
 
 A user's mistake ends LeRobot's commands in one line that names it. LeRobot lets every error end in
 a traceback and wraps those of a device's constructor in its whole configuration, so that what is
@@ -11,6 +11,7 @@ import argparse
 import codecs
 import io
 import os
+import re
 import sys
 import unicodedata
 from collections.abc import Sequence
@@ -164,3 +165,38 @@ def say_count(count: int, noun: str) -> str:
         noun: What, in the singular; a regular one.
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+_NUMBER = re.compile(r"[-+]?\.?\d[-+±/.,:%\d\se]*$|-?$")
+"""Numbers in a table, such as 3/20 or 1.5 ± 0.2; a dash or nothing stands for a missing one."""
+
+
+def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Format a table for a terminal: heads, a rule and a line for each row.
+
+    A column whose cells are all numbers is aligned right, any other one left.
+
+    Args:
+        heads: Head of each column.
+        rows: Cells of each row, as many as there are heads.
+    """
+    columns = list(zip(heads, *rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    right = [any(column[1:]) and all(map(_NUMBER.match, column[1:])) for column in columns]
+    rule = ["-" * width for width in widths]
+    return "\n".join(align_cells(line, widths, right) for line in (heads, rule, *rows))
+
+
+def align_cells(cells: Sequence[str], widths: Sequence[int], right: Sequence[bool]) -> str:
+    """Put the cells of a row into columns of given widths, two spaces apart.
+
+    Args:
+        cells: Texts; one that is too long is cut off with an ellipsis.
+        widths: Characters of each column.
+        right: Whether each column is aligned right.
+    """
+    parts = []
+    for cell, width, is_right in zip(cells, widths, right, strict=True):
+        text = f"{cell[: width - 1]}…" if len(cell) > width else cell
+        parts.append(text.rjust(width) if is_right else text.ljust(width))
+    return "  ".join(parts).rstrip()

@@ -21,7 +21,12 @@ from typing import IO, Any
 
 from tqdm import tqdm
 
-from xop_lerobot.core.command_line import CommandParser, can_print_anything, say_count
+from xop_lerobot.core.command_line import (
+    CommandParser,
+    align_cells,
+    can_print_anything,
+    say_count,
+)
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.curate.arguments import add_source, show_progress
 from xop_lerobot.curate.expression import Kind, UnknownFigure
@@ -197,6 +202,7 @@ class Table:
             max(len(head), len(unit), low)
             for head, unit, low in zip(heads, units, least, strict=True)
         ]
+        self._right = [FIGURES[name].kind is not Kind.TEXT for name in names]
         self.head = f"{self._join(heads)}\n{self._join(units)}"
 
     def format(self, figures: Mapping[str, Any]) -> str:
@@ -204,12 +210,7 @@ class Table:
         return self._join([format_value(name, figures[name]) for name in self._names])
 
     def _join(self, cells: Sequence[str]) -> str:
-        parts = []
-        for name, cell, width in zip(self._names, cells, self._widths, strict=True):
-            is_text = FIGURES[name].kind is Kind.TEXT
-            cell = f"{cell[: width - 1]}…" if len(cell) > width else cell  # noqa: PLW2901
-            parts.append(cell.ljust(width) if is_text else cell.rjust(width))
-        return "  ".join(parts).rstrip()
+        return align_cells(cells, self._widths, self._right)
 
 
 def format_value(name: str, value: Any) -> str:

@@ -25,7 +25,7 @@ from typing import Any
 from xop_lerobot.collect.config import add_config, add_crew, read_config
 from xop_lerobot.collect.folder import CollectFolder
 from xop_lerobot.collect.run import Collection, run_collection
-from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, say_count
+from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, format_table, say_count
 from xop_lerobot.core.errors import BadDataset, BadValue, XopError
 from xop_lerobot.core.folders import FolderTaken, write_whole
 from xop_lerobot.curate.arguments import add_source, parse_episodes
@@ -273,9 +273,8 @@ def report(root: Path, collection: Collection, path: Path | None) -> None:
             }
             for finding in survey(made, names)
         ]
-    print("".join(f"{head:>11}" for head in ("source", "episode", *_FIGURES.values())))
-    for row in rows:
-        print("".join(f"{_show(value):>11}" for value in row.values()))
+    heads = ("source", "episode", *_FIGURES.values())
+    print(format_table(heads, [[_show(value) for value in row.values()] for row in rows]))
     print(f"{say_count(len(rows), 'episode')} in '{root}', made in {collection.wall_s:.0f} s")
     if path is not None:
         document = {"root": str(root), "episodes": rows, "left_out": left_out}

@@ -29,7 +29,7 @@ import mujoco.rollout
 import numpy as np
 
 from xop_lerobot.core.command import Mode, RobotAction
-from xop_lerobot.core.command_line import CommandParser, make_output_readable
+from xop_lerobot.core.command_line import CommandParser, format_table, make_output_readable
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.core.transforms import (
@@ -316,11 +316,10 @@ def _sway(home: np.ndarray, time: float) -> np.ndarray:
 def print_profile(figures: Mapping[str, Any]) -> None:
     """Print the time of each part of a step."""
     whole = figures["step_ms_median"]
-    print(f"\n{'part':<18} {'ms':>8} {'share':>7}")
-    for name, value in figures["profile"].items():
-        print(f"{name:<18} {value:8.2f} {value / whole:7.1%}")
-    print(f"{'step':<18} {whole:8.2f} {1:7.1%}")
-    print(f"{'bare rollout':<18} {figures['rollout_ms_median']:8.2f}")
+    parts = {**figures["profile"], "step": whole}
+    rows = [(name, f"{value:.2f}", f"{value / whole:.1%}") for name, value in parts.items()]
+    rows.append(("bare rollout", f"{figures['rollout_ms_median']:.2f}", ""))
+    print(f"\n{format_table(('part', 'ms', 'share'), rows)}")
 
 
 def make_parser() -> CommandParser:

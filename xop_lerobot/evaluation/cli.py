@@ -22,6 +22,7 @@ from typing import Any
 from xop_lerobot.core.command_line import (
     INTERRUPTED,
     CommandParser,
+    format_table,
     make_output_readable,
     split_pair,
 )
@@ -188,7 +189,7 @@ def run(args: argparse.Namespace) -> int:
     found = [collect(cell, records) for cell in cells]
     rows = [summarise(cell, trials) for cell, trials in zip(cells, found, strict=True)]
     _warn_of_mixture(found, args.out)
-    print(format_table(rows))
+    print(format_rows(rows))
     write_tables(rows, args.json, args.csv)
     if args.report is not None and not interrupted:
         from xop_lerobot.evaluation.report import write_report  # noqa: PLC0415
@@ -259,11 +260,11 @@ def _warn_of_mixture(found: Sequence[Sequence[Mapping[str, Any]]], folder: Path)
         )
 
 
-def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as text, one line each."""
+def format_rows(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Format the rows as a table for a terminal."""
     head = ("robot", "task", "method", "low level", "success", "pickup", "collis.", "falls",
             "CT [s]", "ABP [W]", "tilt [rad]", "jerk [m/s3]", "note")  # fmt: skip
-    lines: list[tuple[str, ...]] = [head]
+    lines: list[tuple[str, ...]] = []
     for row in rows:
         trials = row["trials"]
         counts = [f"{row[n]}/{trials}" for n in ("success", "pickup", "collision", "falls")]
@@ -281,11 +282,7 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
                 row["note"],
             )
         )
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    )
+    return format_table(head, lines)
 
 
 def format_spread(mean: float | None, std: float | None, digits: int) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy import stats
 
+from xop_lerobot.core.command_line import format_table
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.evaluation.metrics import compute_falls, compute_pose_errors
 
@@ -125,7 +126,7 @@ def read_columns(dataset: Any, episode: int = 0) -> dict[str, np.ndarray]:
     }
 
 
-def format_table(summaries: Sequence[EpisodeSummary]) -> str:
+def format_summaries(summaries: Sequence[EpisodeSummary]) -> str:
     """Lay the figures out as a table for a terminal, one row an episode."""
     header = (
         *("robot", "frames", "duration [s]", "engaged [s]", "head error mean [m]"),
@@ -145,14 +146,7 @@ def format_table(summaries: Sequence[EpisodeSummary]) -> str:
         )
         for summary in summaries
     ]
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
-    rule = tuple("-" * width for width in widths)
-    lines = []
-    for row in (header, rule, *rows):
-        first, *others = zip(row, widths, strict=True)
-        cells = [first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in others)]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)
+    return format_table(header, rows)
 
 
 def _get_column(columns: Mapping[str, np.ndarray], key: str) -> np.ndarray:
