@@ -155,9 +155,7 @@ ABLATIONS: dict[str, Ablation] = {
         replaced={"xop_lerobot.retarget.arms.contact:ArmBias.update": _always(None)},
     ),
     "no_ess": Ablation("raw weights, λ = 0.001", {"weighting": "raw", "temperature": 0.001}),
-    "minmax": Ablation("min-max weights, λ = 0.05", {"weighting": "minmax", "temperature": 0.05}),
     "gaussian": Ablation("Gaussian samples", {"sampling": "gaussian"}),
-    "sobol": Ablation("Sobol samples", {"sampling": "sobol"}),
     "raw_noise": Ablation(
         "Gaussian samples, full width at the goal too", {"sampling": "gaussian", "min_noise": 1.0}
     ),

@@ -439,10 +439,12 @@ def test_wrong_overrides_are_told():
 
 
 def test_overrides_are_read_as_yaml():
-    read = parse_overrides(["horizon=5", "weights.control=1e-2", "sampling=sobol", "candidates=[]"])
+    read = parse_overrides(
+        ["horizon=5", "weights.control=1e-2", "sampling=gaussian", "candidates=[]"]
+    )
     assert read["horizon"] == 5
     assert float(read["weights.control"]) == 0.01
-    assert read["sampling"] == "sobol"
+    assert read["sampling"] == "gaussian"
     assert read["candidates"] == []
 
 

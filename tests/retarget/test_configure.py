@@ -183,7 +183,7 @@ def test_weights_alone_leave_the_plan_and_its_optimizer(bench):
         {"horizon": 1},
         {"num_knots": 3, "horizon": 6},
         {"optimizer": "cem"},
-        {"sampling": "sobol"},
+        {"sampling": "gaussian"},
     ],
     ids=str,
 )

@@ -202,7 +202,6 @@ def test_the_cases_are_no_trivial_ones(case):
         {"shift": "measured"},
         {"sampling": "antithetic"},
         {"sample_plan": True},
-        {"weighting": "minmax"},
         {"weighting": "ess"},
         {"importance_cost": False},
     ],

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 
-WEIGHTINGS = ("raw", "minmax", "ess")
-SAMPLINGS = ("gaussian", "antithetic", "sobol")
+WEIGHTINGS = ("raw", "ess")
+SAMPLINGS = ("gaussian", "antithetic")
 KERNEL_MEANS = ("hold", "zero")
 SHIFTS = ("measured", "one")
 CANDIDATES = ("proposal", "paced", "direct", "previous", "stop")
@@ -76,13 +76,12 @@ class MpcConfig:
             command stays, or `zero`, as in the original KMPPI.
         shift: How far the plan moves between two solves: by the time that has passed
             (`measured`), or by `one` control step whatever the time, as in the original.
-        sampling: How noise is drawn: `gaussian`, `antithetic` or `sobol`.
+        sampling: How noise is drawn: `gaussian` or `antithetic`.
         sample_plan: Whether the plan itself is the first sample.
         noise_std: Standard deviation of the samples by command name [its unit].
-        temperature: λ of weighting `raw` [cost], or of `minmax` [share of the cost's range];
-            also that of `importance_cost`.
+        temperature: λ of weighting `raw`, and of `importance_cost` [cost].
         effective_samples: Effective sample size that weighting `ess` aims at [1].
-        weighting: How costs become weights: `raw`, `minmax` or `ess`.
+        weighting: How costs become weights: `raw` or `ess`.
         importance_cost: Whether MPPI's importance-sampling term is part of the cost.
         min_noise: Share of `noise_std` that is left when the robot is at its goal [1].
         full_noise_error: Tracking error at which the noise is full [m, rad].

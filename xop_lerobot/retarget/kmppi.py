@@ -1,17 +1,13 @@
 """KMPPI: model predictive path integral control over kernel-interpolated support points.
 
 The file has what KMPPI consists of: the weights of samples from their costs, the noise, and the
-optimizer. All noise is looked up in a table of 2^16 quantiles of the standard normal distribution:
-a look-up costs a third of a draw. Its largest value is 4.3, the mean zero, the variance 0.99998,
-the kurtosis 2.999.
+optimizer.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
-from statistics import NormalDist
 
 import numpy as np
 
@@ -27,9 +23,9 @@ _MAX_ITERATIONS = 100
 def compute_weights(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
     r"""Weights :math:`w_i \propto \exp(-(J_i - \min J)/\lambda)` that sum to one.
 
-    `raw` takes λ in units of the cost; `minmax` divides by the costs' range first; `ess` finds
-    the λ at which the effective sample size :math:`1/\sum w_i^2` is the wanted one, which makes
-    the update independent of the scale of the cost. Samples whose cost is not finite get none.
+    `raw` takes λ in units of the cost; `ess` finds the λ at which the effective sample size
+    :math:`1/\sum w_i^2` is the wanted one, which makes the update independent of the scale of the
+    cost. Samples whose cost is not finite get none.
 
     Args:
         costs: Total cost of each sample. Shape (K,).
@@ -50,15 +46,9 @@ def compute_weights(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
 
 def _weigh_finite(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
     excess = costs - costs[costs.argmin()]
-    temperature = config.temperature
     if config.weighting == "ess":
         return _compute_ess_weights(excess, config.effective_samples)
-    if config.weighting == "minmax":
-        span = float(excess.max())
-        if span < _LEAST_SPAN:
-            return np.full(len(costs), 1 / len(costs))
-        temperature *= span
-    weights = np.exp(excess * (-1 / temperature))
+    weights = np.exp(excess * (-1 / config.temperature))
     weights *= 1 / weights.sum()
     return weights
 
@@ -114,72 +104,19 @@ def compute_effective_samples(weights: np.ndarray) -> float:
 Draw = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 """(rng, shape) -> standard normal values; the first axis counts the samples."""
 
-_SCRAMBLES = 16
-_BITS = 16
-
 
 def draw_gaussian(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Draw independent samples."""
-    return _make_quantiles().take(_draw_bits(rng, math.prod(shape))).reshape(shape)
+    return rng.standard_normal(shape)
 
 
 def draw_antithetic(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Draw pairs of opposite samples: the mean of an even number is zero."""
-    pairs = (shape[0] + 1) // 2
-    noise = np.empty((2 * pairs, *shape[1:]))
-    first = noise[:pairs]
-    _make_quantiles().take(_draw_bits(rng, first.size).reshape(first.shape), out=first, mode="clip")
-    np.negative(first, out=noise[pairs:])
-    return noise[: shape[0]]
+    first = rng.standard_normal(((shape[0] + 1) // 2, *shape[1:]))
+    return np.concatenate([first, -first])[: shape[0]]
 
 
-def draw_sobol(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    r"""Draw scrambled Sobol points, which fill the space evenly, as normal values.
-
-    A few scrambled point sets per shape are made once. Each call takes one of them and moves it
-    by a random digital shift, :math:`u_{ij} = x_{ij} \oplus s_j`: every point is uniform, and
-    the set as even as before, at the price of a few array operations.
-    """
-    points = _make_sobol(shape[0], math.prod(shape[1:]))
-    bits = _draw_bits(rng, points.shape[2] + 1)
-    return _make_quantiles().take(points[bits[0] % _SCRAMBLES] ^ bits[1:]).reshape(shape)
-
-
-def _draw_bits(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Draw uniform integers below 2^16, four from each word of the generator. Shape (count,)."""
-    if isinstance(rng.bit_generator, np.random.MT19937):  # its words have half the bits
-        return rng.integers(1 << _BITS, size=count, dtype=np.uint16)
-    return rng.bit_generator.random_raw((count + 3) // 4).view(np.uint16)[:count]
-
-
-@lru_cache(maxsize=1)
-def _make_quantiles() -> np.ndarray:
-    """Make the medians of 2^16 intervals of equal probability of the normal distribution."""
-    invert = NormalDist().inv_cdf
-    upper = np.array(
-        [invert((i + 0.5) / (1 << _BITS)) for i in range(1 << (_BITS - 1), 1 << _BITS)]
-    )
-    return np.concatenate([-upper[::-1], upper])
-
-
-@lru_cache(maxsize=16)
-def _make_sobol(count: int, dimension: int) -> np.ndarray:
-    """Scrambled Sobol points as integers below 2^16. Shape (scrambles, count, dimension)."""
-    from scipy.stats import qmc  # noqa: PLC0415
-
-    power = math.ceil(math.log2(count))  # whole blocks are balanced
-    sets = [
-        qmc.Sobol(dimension, rng=np.random.default_rng(seed)).random_base2(power)[:count]
-        for seed in range(_SCRAMBLES)
-    ]
-    return (np.stack(sets) * (1 << _BITS)).astype(np.uint16)
-
-
-DRAWS: dict[str, Draw] = {
-    "gaussian": draw_gaussian,
-    "antithetic": draw_antithetic,
-    "sobol": draw_sobol,
-}
+DRAWS: dict[str, Draw] = {"gaussian": draw_gaussian, "antithetic": draw_antithetic}
 
 
 __all__ = ["Kmppi", "Samples", "compute_effective_samples", "compute_weights"]
