@@ -98,6 +98,12 @@ ARMS_COLUMNS = {
     "foot [cm]": "foot_cm",
     "tilt, worst [°]": "tilt_deg",
 }
+BEYOND_COLUMNS = {
+    "missed by [cm]": "final_cm",
+    "missed by [°]": "final_deg",
+    "foot [cm]": "foot_cm",
+    "tilt, worst [°]": "tilt_deg",
+}
 SUMMED = ("falls", "collisions", "goals", "collided_goals", "arrived_goals")
 ABLATION_COLUMNS = {
     "final [cm]": "final_mean_cm",
@@ -114,7 +120,12 @@ ABLATION_COLUMNS = {
 
 def get_columns(scenario: Scenario) -> dict[str, str]:
     """Figures by heading that tell a run of `scenario`."""
-    special = {"curve": CURVE_COLUMNS, "room": ROOM_COLUMNS, "arms": ARMS_COLUMNS}
+    special = {
+        "curve": CURVE_COLUMNS,
+        "room": ROOM_COLUMNS,
+        "arms": ARMS_COLUMNS,
+        "beyond": BEYOND_COLUMNS,
+    }
     if scenario.name in special:
         return special[scenario.name]
     return STATIONARY_COLUMNS if scenario.mode is Mode.STATIONARY else MOBILE_COLUMNS

@@ -209,6 +209,15 @@ def _room(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: in
     return GoalTrack(home, start, tuple(steps))
 
 
+def _beyond(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
+    """One place that a robot on the spot can't reach: far off, low, and with a tilt."""
+    del num_goals
+    turn, far = rng.uniform(-math.pi, math.pi), rng.uniform(0.5, 1.0)
+    bent = bend_from(home, yaw=rng.uniform(-2.5, 2.5), pitch=rng.uniform(-0.5, 0.8))
+    offset = [far * math.cos(turn), far * math.sin(turn), -rng.uniform(0.0, 0.8)]
+    return _hold_each(home, (make_pose(bent[:3] + offset, bent[3:]), home), hold)
+
+
 def _arms(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
     """Figure 2 of the paper: arms forward and high first, then squat and pitch, then back."""
     del num_goals
@@ -252,6 +261,13 @@ SCENARIOS: dict[str, Scenario] = {
     "room": Scenario(
         "room", "goals 0.25 m from walls", Mode.MOBILE, _room, "room", MOBILE_TOLERANCE
     ),
+    "beyond": Scenario(
+        "beyond",
+        "beyond what a robot on the spot can reach, and back",
+        Mode.STATIONARY,
+        _beyond,
+        tolerances=STATIONARY_TOLERANCE,
+    ),
     "arms": Scenario(
         "arms",
         "arms forward and high, squat and pitch",
@@ -269,5 +285,6 @@ SCENARIO_GROUPS: dict[str, tuple[str, ...]] = {
     "anywhere": ("anywhere",),
     "room": ("room",),
     "arms": ("arms",),
+    "beyond": ("beyond",),
 }
 """Scenarios that are told by the same figures, one table each."""
