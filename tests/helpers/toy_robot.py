@@ -25,6 +25,7 @@ from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.core.state import RobotState
 from xop_lerobot.low_level.factory import POLICIES
 from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
+from xop_lerobot.morphology.contacts import Feet
 from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ArmChain, ModelKind, Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
@@ -90,7 +91,7 @@ class Toy(Morphology):
     effects = (Effect(Acts.JOINT, joint="lift", lag_s=0.1), Effect(Acts.TURN, modes=()))
     fall_height = 0.1
     fall_tilt = 0.5
-    wheeled = False
+    contact_kind = Feet()
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
         del kind

@@ -18,6 +18,7 @@ from ports import find_port
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 from xop_lerobot.core.transforms import quat_from_rpy
+from xop_lerobot.morphology.contacts import Feet
 from xop_lerobot.morphology.morphology import ArmChain, Morphology, make_morphology
 from xop_lerobot.plant.config import NOISE_PRESETS, NoiseConfig, SimulationConfig
 from xop_lerobot.plant.plant import Plant
@@ -73,7 +74,7 @@ class Toy(Morphology):
     contact_points = ("corner",)
     fall_height = 0.05
     fall_tilt = 0.8
-    wheeled = False
+    contact_kind = Feet()
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
         del kind

@@ -20,6 +20,7 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
     quat_yaw,
 )
+from xop_lerobot.morphology.contacts import Feet, Wheels
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.recording.columns import COST_NAMES
 from xop_lerobot.retarget.costs import (
@@ -183,7 +184,7 @@ def compute_stance_slowly(e: Evaluation, groups: tuple[tuple[str, ...], ...]) ->
 )
 def test_stance_equals_its_formula(mode, groups):
     e = make_evaluation(mode=mode)
-    cost = StanceCost(groups, wheeled=False).compute(e)
+    cost = StanceCost(groups, Feet()).compute(e)
     np.testing.assert_allclose(cost, compute_stance_slowly(e, groups))
 
 
@@ -194,14 +195,14 @@ def test_in_mobile_mode_the_swinging_foot_is_free():
     points = {"a": still, "b": still + np.array([0, 0, 0.05])}
     velocities = {"a": still, "b": swinging}
     e = make_evaluation(points=points, velocities=velocities, mode=Mode.MOBILE)
-    cost = StanceCost((("a",), ("b",)), wheeled=False)
+    cost = StanceCost((("a",), ("b",)), Feet())
     np.testing.assert_array_equal(cost.compute(e), [0])
     standing = dataclasses.replace(e, mode=Mode.STATIONARY)
     np.testing.assert_allclose(cost.compute(standing), [WEIGHTS.stance])
 
 
 def test_wheels_may_roll_in_mobile_mode_only():
-    cost = StanceCost((("a",), ("b",)), wheeled=True)
+    cost = StanceCost((("a",), ("b",)), Wheels())
     np.testing.assert_array_equal(cost.compute(make_evaluation(mode=Mode.MOBILE)), np.zeros(K))
     assert (cost.compute(make_evaluation(mode=Mode.STATIONARY)) > 0).all()
 
@@ -407,7 +408,7 @@ BOX = Obstacle(
 ALL = (
     TrackingCost(),
     TerminalCost(),
-    StanceCost((("a",), ("b",)), wheeled=False),
+    StanceCost((("a",), ("b",)), Feet()),
     CollisionCost((BOX,), {"a": 0.1}),
     ControlCost(np.ones(NA)),
     SupportCost(SupportArea(SQUARE)),

@@ -9,6 +9,7 @@ import pytest
 import toy_robot
 
 from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.morphology.contacts import Feet, Wheels
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.sync.config import SyncConfig
@@ -24,7 +25,7 @@ from xop_lerobot.retarget.sync.task import SyncTask
 class WheeledToy(toy_robot.Toy):
     """Wheels whose turning the model leaves out: their contact points are on the base."""
 
-    wheeled = True
+    contact_kind = Wheels()
 
 
 MORPHOLOGIES = {
@@ -44,9 +45,9 @@ def robot(request):
 def make_task(robot, kind=SyncTask):
     morphology, model = robot
     contacts = make_contacts(morphology, model)
-    task = kind(model, contacts, morphology.wheeled, SyncConfig())
+    task = kind(model, contacts, morphology.contact_kind, SyncConfig())
     rng = np.random.default_rng(0)
-    rows = 2 if morphology.wheeled else 7
+    rows = morphology.contact_kind.rows
     task.set_measurement(disturb(model, morphology.standing_qpos(), rng, 0.3))
     stance = rng.normal(size=(len(contacts), 3))
     task.set_active(range(len(contacts)), [rng.uniform(0.1, 1, rows) for _ in contacts], stance)
@@ -183,7 +184,7 @@ def test_contact_velocity_equals_finite_differences(robot):
     """Of the material point that touches the ground, as the robot moves for a microsecond."""
     morphology, model = robot
     contacts = make_contacts(morphology, model)
-    velocity = ContactVelocity(model, contacts, morphology.wheeled, SyncConfig())
+    velocity = ContactVelocity(model, contacts, morphology.contact_kind, SyncConfig())
     rng = np.random.default_rng(0)
     data = mujoco.MjData(model)
     qpos, qvel = disturb(model, morphology.standing_qpos(), rng, 0.05), rng.normal(size=model.nv)
@@ -207,11 +208,11 @@ def test_contact_velocity_equals_finite_differences(robot):
             ends.append(data.xpos[contact.body] + data.xmat[contact.body].reshape(3, 3) @ local)
         speed = (ends[0] - ends[1]) / 2e-6
         got = jacobian @ qvel
-        if morphology.wheeled and not contact.rolls:
+        if isinstance(morphology.contact_kind, Wheels) and not contact.rolls:
             np.testing.assert_allclose(got, [axle @ speed, speed[2]], atol=1e-6)
         else:
             np.testing.assert_allclose(got[:3], speed, atol=1e-6)
-        if not morphology.wheeled:  # the foot turns as a rigid body
+        if isinstance(morphology.contact_kind, Feet):  # the foot turns as a rigid body
             data.qpos[:] = qpos
             mujoco.mj_fwdPosition(model, data)
             data.qvel[:] = qvel
@@ -264,7 +265,7 @@ def test_wheels_roll_without_slipping():
     morphology = make_morphology("rby1")
     model = build_model(morphology, "planning")
     contacts = make_contacts(morphology, model)
-    velocity = ContactVelocity(model, contacts, wheeled=True, config=SyncConfig())
+    velocity = ContactVelocity(model, contacts, Wheels(), config=SyncConfig())
     data = mujoco.MjData(model)
     data.qpos[:] = compute_equilibrium(model, morphology.standing_qpos())
     mujoco.mj_kinematics(model, data)

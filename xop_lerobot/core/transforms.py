@@ -240,6 +240,12 @@ def _double_angle(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     return 2 * np.arctan2(np.where(cosine < 0, -sine, sine), np.abs(cosine))
 
 
+def skew(v: np.ndarray) -> np.ndarray:
+    """Matrix of the cross product with `v`. Shape (3,) -> (3, 3)."""
+    x, y, z = v
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray:
     """Wrap to (-pi, pi] [rad]."""
     return -((-np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi)

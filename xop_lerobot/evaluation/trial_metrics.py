@@ -66,9 +66,9 @@ def compute_metrics(trial: Trial) -> dict[str, float]:
         "hands_error": float(np.mean([each.mean for each in hands])),
         "hands_error_p95": float(np.mean([each.p95 for each in hands])),
         "roughness": compute_roughness(trace.command[trace.engaged], half, dt),
-        "slip": math.nan
-        if morphology.wheeled
-        else compute_slip(compute_feet(morphology, trace.qpos), dt),
+        "slip": compute_slip(compute_feet(morphology, trace.qpos), dt)
+        if morphology.contact_kind.holds_place(Mode.MOBILE)
+        else math.nan,  # wheels roll
         "standing": float(standing.sum() / max(trace.engaged.sum(), 1)),
         "plan_ms": float(np.median(solves)) if solves.size else math.nan,
         "plan_p99_ms": float(np.percentile(solves, 99)) if solves.size else math.nan,

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from xop_lerobot.low_level.policy import LowLevelPolicy
     from xop_lerobot.low_level.rest import RestMap
+    from xop_lerobot.morphology.contacts import ContactKind
 
 ModelKind = Literal["full", "planning"]
 
@@ -110,8 +111,8 @@ class Morphology(ABC):
     """Base height over the ground under which the robot counts as fallen [m]."""
     fall_tilt: float
     """Tilt of the base over which the robot counts as fallen [rad]."""
-    wheeled: bool
-    """Whether it stands on wheels (contact points roll, the base stays level)."""
+    contact_kind: ContactKind
+    """How it touches the ground: on `Feet` or on `Wheels`."""
 
     ramps: bool = False
     """Whether its controller goes from each set of targets to the next in a straight line."""
@@ -138,6 +139,9 @@ class Morphology(ABC):
     servo_gap: float = math.inf
     """How far a joint of the command may be behind its target before its servo counts as giving
     way [rad]; infinite where a policy, not a servo, follows the command."""
+    largest_offset: float = 0.2
+    """How far height and joints may rest beside their command and the planner counts on it, in
+    shares of the command's half range [1]."""
     has_stiff_body: bool = False
     """Whether the joints of the command are on stiff servos that do just as they are told."""
     posture_limits: Mapping[str, tuple[float, float]] = {}

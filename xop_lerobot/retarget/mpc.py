@@ -80,7 +80,7 @@ class MpcRetargeter(Retargeter):
         self.drift = DriftObserver(self.command_model, lag_s=morphology.velocity_lag_s)
         # A servo at its limit may be far from its command, and the rest of the torso has to know;
         # a policy that is far from it is on its way.
-        largest = 1.0 if morphology.wheeled else 0.2
+        largest = morphology.largest_offset
         self.offset = OffsetObserver(self.command_model, largest=largest)
         self.problem = Problem(
             morphology,

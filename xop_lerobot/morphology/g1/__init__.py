@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
+from xop_lerobot.morphology.contacts import Feet
 from xop_lerobot.morphology.g1.links import LINKS
 from xop_lerobot.morphology.g1.mpc import EFFECTS, STANDING_REACH, mpc_config
 from xop_lerobot.morphology.g1.shapes import FOOT_POINTS
@@ -112,7 +113,7 @@ class G1(Morphology):
     effects = EFFECTS
     fall_height = 0.35
     fall_tilt = 0.8
-    wheeled = False
+    contact_kind = Feet()
     standing_reach = STANDING_REACH
     point_heights, top_heights = (0.25, 1.3), (0.3, 1.1)
     # The container is out of reach of who only stands: it walks first.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
+from xop_lerobot.morphology.contacts import Wheels
 from xop_lerobot.morphology.morphology import (
     ArmChain,
     ModelKind,
@@ -128,6 +129,8 @@ class RBY1(Morphology):
     pivot = PIVOT
     support = SUPPORT
     has_stiff_body = True
+    # A servo at its limit may rest anywhere.
+    largest_offset = 1.0
     # Moving, its servos are behind by 0.05 rad, bending quickly by 0.2 for a moment; a torso that
     # folds leaves 0.3 to 1.5 for good.
     servo_gap = 0.15
@@ -141,7 +144,7 @@ class RBY1(Morphology):
     hull_hands = ("left_palm", "right_palm")
     fall_height = -0.2
     fall_tilt = 0.35
-    wheeled = True
+    contact_kind = Wheels()
     # Its servos follow within 10 ms: targets in steps would shake the hands.
     ramps = True
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import quat_yaw, sum_squares, wrap_angle
+from xop_lerobot.morphology.contacts import ContactKind
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.static_load import StaticLoad
 
@@ -169,22 +170,22 @@ class StanceCost(Cost):
 
     Points come in groups that touch the ground together (the four of a foot); each group counts
     by the mean of its points. C holds every group in stationary mode, and in mobile mode the
-    lowest group of each step, the standing foot. On wheels, which must roll, only stationary
-    mode counts.
+    lowest group of each step, the standing foot. Contacts that do not hold their place in a mode,
+    wheels that must roll, cost nothing in it.
 
     Args:
         groups: Sites of each group of contact points.
-        wheeled: Whether the robot stands on wheels.
+        kind: What they are of.
     """
 
     name = "stance"
 
-    def __init__(self, groups: tuple[tuple[str, ...], ...], wheeled: bool) -> None:
-        self.groups, self.wheeled = groups, wheeled
+    def __init__(self, groups: tuple[tuple[str, ...], ...], kind: ContactKind) -> None:
+        self.groups, self.kind = groups, kind
 
     def compute(self, evaluation: Evaluation) -> np.ndarray:
         """Cost of every sample. Shape (K,)."""
-        if self.wheeled and evaluation.mode is Mode.MOBILE:
+        if not self.kind.holds_place(evaluation.mode):
             return np.zeros(len(evaluation.qpos))
         speeds = []
         for group in self.groups:

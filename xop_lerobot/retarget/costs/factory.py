@@ -50,7 +50,7 @@ def make_costs(
     costs = (
         TrackingCost(),
         TerminalCost(),
-        StanceCost(morphology.contact_groups, morphology.wheeled),
+        StanceCost(morphology.contact_groups, morphology.contact_kind),
         collision,
         ControlCost((space.high - space.low) / 2),
         ChangeCost((space.high - space.low) / 2),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue, UnknownName
+from xop_lerobot.morphology.contacts import Contact, ContactKind
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.sync.config import SyncConfig
 
@@ -19,31 +19,6 @@ _CONTACT_ROWS = (
     int(mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL),
     int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC),
 )
-
-
-@dataclass(frozen=True)
-class Contact:
-    """A foot or a wheel.
-
-    Attributes:
-        name: Site of its first point.
-        body: Body that it is.
-        point: Mean of its points in the body's frame, of a wheel its centre [m]. Shape (3,).
-        axis: Direction in the body's frame: of a foot, up; of a wheel, its axle. Shape (3,).
-        forward: Direction in the body's frame that a foot faces. Shape (3,).
-        height: Height of `point` over z = 0 when it bears its share of the weight [m].
-        radius: Distance from `point` down to the ground, 0 for a foot [m].
-        rolls: Whether the body turns about `axis` against the one it is mounted on.
-    """
-
-    name: str
-    body: int
-    point: np.ndarray
-    axis: np.ndarray
-    forward: np.ndarray
-    height: float
-    radius: float
-    rolls: bool
 
 
 def make_contacts(
@@ -81,23 +56,10 @@ def make_contacts(
         rotation = data.xmat[body].reshape(3, 3)
         height = float((data.xpos[body] + rotation @ point)[2]) + sink
         joint = int(model.body_jntadr[body])
-        rolls = bool(
-            morphology.wheeled
-            and model.body_jntnum[body]
-            and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
-        )
-        axis = rotation.T[:, 1] if morphology.wheeled else rotation.T[:, 2]
+        turns = model.body_jntnum[body] and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+        hinge = model.jnt_axis[joint] if turns else None
         contacts.append(
-            Contact(
-                name=group[0],
-                body=body,
-                point=point,
-                axis=(model.jnt_axis[joint] if rolls else axis).copy(),
-                forward=rotation.T[:, 0].copy(),
-                height=height,
-                radius=height if morphology.wheeled else 0.0,
-                rolls=rolls,
-            )
+            morphology.contact_kind.make_contact(group[0], body, point, rotation, height, hinge)
         )
     return tuple(contacts)
 
@@ -208,12 +170,12 @@ class StanceMemory:
 
     Args:
         contacts: The robot's feet or wheels.
-        wheeled: Whether they are wheels; wheels have no place.
+        kind: What they are; only those that step are remembered.
         config: Times and tolerances.
     """
 
-    def __init__(self, contacts: Sequence[Contact], wheeled: bool, config: SyncConfig) -> None:
-        self.contacts, self.wheeled, self.config = tuple(contacts), wheeled, config
+    def __init__(self, contacts: Sequence[Contact], kind: ContactKind, config: SyncConfig) -> None:
+        self.contacts, self.kind, self.config = tuple(contacts), kind, config
         self.places = np.zeros((len(self.contacts), 3))
         """x, y [m] and heading [rad] of every foot in the world. Shape (contacts, 3)."""
         self.active: tuple[int, ...] = ()
@@ -235,7 +197,7 @@ class StanceMemory:
 
     def get_landing(self, index: int) -> float:
         """How much of its touch-down is left in a contact, 1 at first, then falling to 0."""
-        if self.wheeled:
+        if not self.kind.steps:
             return 0.0
         return math.exp(-self._landed[index] / self.config.touchdown_s)
 
@@ -252,7 +214,7 @@ class StanceMemory:
         active = []
         for index, contact in enumerate(self.contacts):
             raised = heights[index] - heights[lowest] > self.config.lift_height
-            if not self.wheeled:
+            if self.kind.steps:
                 raised |= mode is Mode.MOBILE and index != lowest
             if raised or not self._is_near_ground(contact, heights[index], data):
                 self.release(index)
@@ -266,11 +228,7 @@ class StanceMemory:
 
     def _is_near_ground(self, contact: Contact, height: float, data: mujoco.MjData) -> bool:
         upright = float(data.xmat[contact.body, 6:9] @ contact.axis)  # cosine to the vertical
-        tilt = (
-            abs(math.asin(max(-1.0, min(1.0, upright))))
-            if self.wheeled
-            else math.acos(max(-1.0, min(1.0, upright)))
-        )
+        tilt = self.kind.compute_tilt(upright)
         return abs(height) < self.config.lost_height and tilt < self.config.lost_tilt
 
     def remember(
@@ -327,9 +285,5 @@ class StanceMemory:
             landing = self.get_landing(index)
             height = config.contact_height + landing * config.touchdown_height
             tilt = config.contact_tilt + landing * config.touchdown_tilt
-            if self.wheeled:
-                rows.append(np.array([height, tilt]))
-                continue
-            place, heading = self._spread[index]
-            rows.append(np.array([place, place, height, tilt, tilt, tilt, heading]))
+            rows.append(self.kind.arrange_std(*self._spread[index], height, tilt))
         return rows

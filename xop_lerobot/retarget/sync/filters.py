@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from xop_lerobot.morphology.contacts import Contact, ContactKind
 from xop_lerobot.retarget.sync.config import SyncConfig
-from xop_lerobot.retarget.sync.contacts import Contact
 
 _GROUPS = (slice(0, 3), slice(3, 5), slice(5, 6), slice(6, None))
 """Degrees of freedom that one sensor measures: position, tilt, heading, joints."""
@@ -232,27 +232,26 @@ def solve_positive(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 class ContactVelocity:
-    r"""Jacobian of the velocities that are zero while the contacts hold.
+    """Jacobian of the velocities that are zero while the contacts hold.
 
-    - Standing foot: velocity of its point [m/s] and its angular velocity [rad/s], 6 rows.
-    - Rolling wheel without slip: velocity of the wheel's material point that touches the ground,
-      :math:`c - r e_z`, 3 rows: nothing sideways, nothing vertical, forward velocity of the centre
-      equal to wheel speed times radius.
-    - Wheel whose turning is no joint of the model: velocity of its centre along the axle and
-      vertical, 2 rows.
-    - On wheels also roll and pitch rate of the base, 2 rows, since all wheels stay down.
+    Those of each contact are what `Feet` and `Wheels` say, m rows. On wheels also roll and pitch
+    rate of the base, 2 rows, since all wheels stay down.
 
     Args:
         model: Robot on a free base.
         contacts: Its feet or wheels.
-        wheeled: Whether they are wheels.
+        kind: What they are.
         config: Standard deviations.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, contacts: Sequence[Contact], wheeled: bool, config: SyncConfig
+        self,
+        model: mujoco.MjModel,
+        contacts: Sequence[Contact],
+        kind: ContactKind,
+        config: SyncConfig,
     ) -> None:
-        self.model, self.contacts, self.wheeled = model, tuple(contacts), wheeled
+        self.model, self.contacts, self.kind = model, tuple(contacts), kind
         self.config = config
         self._base = int(model.jnt_bodyid[0])
 
@@ -265,11 +264,7 @@ class ContactVelocity:
             point[2] -= contact.radius
         jacobian = np.empty((6, self.model.nv))
         mujoco.mj_jac(self.model, data, jacobian[:3], jacobian[3:], point, contact.body)
-        if not self.wheeled:
-            return jacobian
-        if contact.rolls:
-            return jacobian[:3]
-        return np.stack([(rotation @ contact.axis) @ jacobian[:3], jacobian[2]])
+        return self.kind.select_velocities(contact, rotation, jacobian)
 
     def compute_variance(self, index: int, landing: float) -> np.ndarray:
         """Variance of each row of J v of one contact.
@@ -283,10 +278,8 @@ class ContactVelocity:
         """
         config = self.config
         linear = config.contact_velocity**2 + (landing * config.touchdown_velocity) ** 2
-        if self.wheeled:
-            return np.full(3 if self.contacts[index].rolls else 2, linear)
         angular = config.contact_rate**2 + (landing * config.touchdown_rate) ** 2
-        return np.array([linear] * 3 + [angular] * 3)
+        return self.kind.arrange_variance(self.contacts[index], linear, angular)
 
     def compute_level_jacobian(self, data: mujoco.MjData) -> np.ndarray:
         """Compute J of the roll and pitch rate of a base on wheels, world axes. Shape (2, nv)."""

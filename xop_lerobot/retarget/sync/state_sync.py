@@ -87,11 +87,11 @@ class StateSync:
     ) -> None:
         self.morphology, self.model = morphology, model
         self.config = config = config or SyncConfig()
-        wheeled = morphology.wheeled
+        self._kind = kind = morphology.contact_kind
         self.contacts = make_contacts(morphology, model, equilibrium=config.equilibrium)
-        self.task = SyncTask(model, self.contacts, wheeled, config)
-        self.stance = StanceMemory(self.contacts, wheeled, config)
-        self._contact_velocity = ContactVelocity(model, self.contacts, wheeled, config)
+        self.task = SyncTask(model, self.contacts, kind, config)
+        self.stance = StanceMemory(self.contacts, kind, config)
+        self._contact_velocity = ContactVelocity(model, self.contacts, kind, config)
         self._configuration = mink.Configuration(model)
         self._limit = mink.ConfigurationLimit(model, gain=1.0)
         limited = model.jnt_limited.astype(bool)
@@ -208,7 +208,7 @@ class StateSync:
         if config.recursive:
             qvel = qvel.copy()
             qvel[:3] = self._bias.update(qpos[:3], qvel[:3], dt)
-        if last is None or self.morphology.wheeled:  # wheels tell more than any prediction
+        if last is None or self._kind.tells_speed:
             expected = None
         velocity, variance = self._project(qvel, expected)
         mean, carried = velocity, variance
@@ -241,7 +241,7 @@ class StateSync:
         self.task.set_measurement(measured, std)
         active, contact_std = self.stance.active, self.stance.compute_std()
         self.task.set_active(active, contact_std, self.stance.places)
-        row = self.task.height_row
+        row = self._kind.height_row
         self._height_variance = 1 / (std[2] ** -2 + sum(one[row] ** -2 for one in contact_std))
         iterations, bounded = self._descend()
         self._last_time, self._is_new = time, False
@@ -295,7 +295,7 @@ class StateSync:
             variances.append(allowed)
         if disagreements and self.config.recursive:
             self._observe_noise(min(disagreements))
-        if jacobians and self.morphology.wheeled:
+        if jacobians and self._kind.keeps_level:
             jacobians.append(self._contact_velocity.compute_level_jacobian(data))
             variances.append(np.full(2, self.config.contact_rate**2))
         if not jacobians:

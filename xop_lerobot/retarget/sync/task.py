@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import mink
 import mujoco
 import numpy as np
 
+from xop_lerobot.core.transforms import skew
+from xop_lerobot.morphology.contacts import Contact, ContactKind
 from xop_lerobot.retarget.sync.config import SyncConfig
-from xop_lerobot.retarget.sync.contacts import Contact, compute_height
+from xop_lerobot.retarget.sync.contacts import compute_height
 
 
 class SyncTask(mink.Task):
@@ -25,15 +26,10 @@ class SyncTask(mink.Task):
     base position         :math:`p - \tilde p`                           3         m
     base orientation      :math:`\log(R \tilde R^\top)`, world axes      3         rad
     joints                :math:`q - \tilde q`                           nv - 6    rad, m
-    foot, position        :math:`c_i - p^{world}_{c,i}`                  3 a foot  m
-    foot, flat            :math:`R R_{c,i} e_z - e_z`                    3 a foot  1
-    foot, heading         :math:`\psi(R R_{c,i} e_x) - \psi^{world}_i`   1 a foot  rad
-    wheel, height         :math:`e_z^\top c_i - r_i`                     1 a wheel m
-    wheel, axle           :math:`e_z^\top R R_{c,i} e_y`                 1 a wheel 1
+    each contact          see `Feet` and `Wheels`                        `rows`
     ===================== ============================================== ========= ============
 
-    Heading is an addition: the paper knows where a foot stands but not where it points. Steps
-    are in the tangent space of MuJoCo's free joint: linear in the world, angular in the body.
+    Steps are in the tangent space of MuJoCo's free joint: linear in the world, angular in the body.
 
     One task instead of mink's stock ones: rows that never change are filled once, and one pass
     over the contacts gives residual and Jacobian.
@@ -41,7 +37,7 @@ class SyncTask(mink.Task):
     Args:
         model: Robot on a free base.
         contacts: Its feet or wheels.
-        wheeled: Whether they are wheels.
+        kind: What they are.
         config: Standard deviations; the task's cost is one over them.
     """
 
@@ -49,16 +45,13 @@ class SyncTask(mink.Task):
         self,
         model: mujoco.MjModel,
         contacts: Sequence[Contact],
-        wheeled: bool,
+        kind: ContactKind,
         config: SyncConfig,
     ) -> None:
-        self.contacts, self.wheeled, self.config = tuple(contacts), wheeled, config
+        self.contacts, self.kind, self.config = tuple(contacts), kind, config
         self.model = model
         self._num_own = num_own = model.nv
-        self._per_contact = 2 if wheeled else 7
-        self.height_row = 0 if wheeled else 2
-        """Which of the rows of a contact is its height."""
-        rows = num_own + self._per_contact * len(self.contacts)
+        rows = num_own + kind.rows * len(self.contacts)
         self._jacobian = np.zeros((rows, model.nv))
         self._jacobian[:num_own] = np.eye(num_own)
         self._error = np.zeros(rows)
@@ -94,8 +87,8 @@ class SyncTask(mink.Task):
 
         Args:
             active: Indices of contacts.
-            std: Standard deviation of each row of each of them; infinite for none. Shapes (7,)
-                for a foot, (2,) for a wheel.
+            std: Standard deviation of each row of each of them; infinite for none. Shapes
+                (`kind.rows`,).
             stance: x, y and heading of every contact. Shape (contacts, 3).
         """
         self._active, self._stance = tuple(active), stance
@@ -151,48 +144,21 @@ class SyncTask(mink.Task):
         jacobian[3:6, 3:6] = _inverse_left_jacobian(turn) @ rotation if turn.any() else rotation
         row = self._num_own
         for index in self._active:
-            evaluate = self._evaluate_wheel if self.wheeled else self._evaluate_foot
-            evaluate(data, index, row)
-            row += self._per_contact
-
-    def _evaluate_foot(self, data: mujoco.MjData, index: int, row: int) -> None:
-        contact, error, jacobian = self.contacts[index], self._error, self._jacobian
-        rotation = data.xmat[contact.body].reshape(3, 3)
-        point = data.xpos[contact.body] + rotation @ contact.point
-        mujoco.mj_jac(self.model, data, self._jacp, self._jacr, point, contact.body)
-        stance = self._stance[index]
-        error[row : row + 2] = point[:2] - stance[:2]
-        error[row + 2] = point[2] - contact.height
-        jacobian[row : row + 3] = self._jacp
-        up, forward = rotation @ contact.axis, rotation @ contact.forward
-        error[row + 3 : row + 6] = up
-        error[row + 5] -= 1
-        jacobian[row + 3 : row + 6] = -_skew(up) @ self._jacr
-        # psi = atan2(f_y, f_x), f' = omega x f
-        length = forward[0] ** 2 + forward[1] ** 2
-        turn = np.array([-forward[0] * forward[2], -forward[1] * forward[2], length]) / length
-        jacobian[row + 6] = turn @ self._jacr
-        error[row + 6] = _wrap(math.atan2(forward[1], forward[0]) - stance[2])
-
-    def _evaluate_wheel(self, data: mujoco.MjData, index: int, row: int) -> None:
-        contact, error, jacobian = self.contacts[index], self._error, self._jacobian
-        rotation = data.xmat[contact.body].reshape(3, 3)
-        point = data.xpos[contact.body] + rotation @ contact.point
-        mujoco.mj_jac(self.model, data, self._jacp, self._jacr, point, contact.body)
-        axle = rotation @ contact.axis
-        error[row], error[row + 1] = point[2] - contact.height, axle[2]
-        jacobian[row] = self._jacp[2]
-        jacobian[row + 1] = axle[1] * self._jacr[0] - axle[0] * self._jacr[1]  # (w x axle)_z
-
-
-def _wrap(angle: float) -> float:
-    """Wrap to [-pi, pi) [rad]."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
-
-
-def _skew(v: np.ndarray) -> np.ndarray:
-    x, y, z = v
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+            contact, end = self.contacts[index], row + self.kind.rows
+            rotation = data.xmat[contact.body].reshape(3, 3)
+            point = data.xpos[contact.body] + rotation @ contact.point
+            mujoco.mj_jac(self.model, data, self._jacp, self._jacr, point, contact.body)
+            self.kind.fill_residuals(
+                contact,
+                rotation,
+                point,
+                self._stance[index],
+                self._jacp,
+                self._jacr,
+                error[row:end],
+                jacobian[row:end],
+            )
+            row = end
 
 
 def _inverse_left_jacobian(turn: np.ndarray) -> np.ndarray:
@@ -201,10 +167,10 @@ def _inverse_left_jacobian(turn: np.ndarray) -> np.ndarray:
     :math:`J_l^{-1} = I - \frac12[\theta] + (\frac1{\theta^2} - \frac{1+\cos\theta}
     {2\theta\sin\theta})[\theta]^2` (Solà et al., A micro Lie theory, Eq. 146).
     """
-    skew = _skew(turn)
+    cross = skew(turn)
     angle = float(np.sqrt(turn @ turn))
     if angle < 1e-4:  # the series' next term is under 1e-12
         factor = 1 / 12
     else:
         factor = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
-    return np.eye(3) - 0.5 * skew + factor * skew @ skew
+    return np.eye(3) - 0.5 * cross + factor * cross @ cross
