@@ -43,7 +43,8 @@ class Robot:
         self.site = self.morphology.frames["head"]
         self._placement = Placement(model, (self.site,), com_of=self.morphology.base_body)
         joints = [effect.joint for effect in self.morphology.effects if effect.joint]
-        self.load = StaticLoad(model, joints, self.morphology.load_share)
+        share = self.morphology.servos.load_share if self.morphology.servos else 0.75
+        self.load = StaticLoad(model, joints, share)
 
     def rest(self, command: np.ndarray) -> np.ndarray:
         """Where it comes to rest on the spot. Shape (nq,)."""

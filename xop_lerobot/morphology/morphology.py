@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -84,6 +83,20 @@ class Work:
     walk: tuple[float, float] = (0.0, 0.0)
 
 
+@dataclass(frozen=True)
+class Servos:
+    """Stiff servos on the joints of the command, which do just as they are told.
+
+    Attributes:
+        gap: How far a joint may be behind its target before its servo counts as giving way [rad].
+        load_share: Share of its largest torque that a joint may need to hold a posture [1]; the
+            rest is for moving there.
+    """
+
+    gap: float
+    load_share: float = 0.75
+
+
 class Morphology(ABC):
     """A robot, as far as retargeting is concerned. One folder per robot, no other code knows it.
 
@@ -136,20 +149,14 @@ class Morphology(ABC):
     support: tuple[tuple[float, float], ...] = ()
     """Corners (x, y) in the base's frame, counterclockwise, of the area on which a robot that
     cannot step stands [m]; empty for one whose policy keeps the balance."""
-    servo_gap: float = math.inf
-    """How far a joint of the command may be behind its target before its servo counts as giving
-    way [rad]; infinite where a policy, not a servo, follows the command."""
     largest_offset: float = 0.2
     """How far height and joints may rest beside their command and the planner counts on it, in
     shares of the command's half range [1]."""
-    has_stiff_body: bool = False
-    """Whether the joints of the command are on stiff servos that do just as they are told."""
+    servos: Servos | None = None
+    """The servos that follow the joints of the command; None where a policy follows it."""
     posture_limits: Mapping[str, tuple[float, float]] = {}
     """Angles within which joints of the command are kept [rad] wherever a goal does not need
     more, by entry: the knees that it is to bend."""
-    load_share: float = 0.75
-    """Share of its largest torque that a joint of a stiff body may need to hold a posture [1]; the
-    rest is for moving there."""
     standing_reach: float = 0.3
     """How far from where it rests the head of a robot that stands is led [m]."""
 

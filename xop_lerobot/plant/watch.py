@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 
@@ -33,7 +35,7 @@ SPEED = 0.3
 SPAN_S = 0.5
 """Time over which that mean is taken [s]."""
 GAP_S = 0.3
-"""Time for which a servo may be behind its target by more than the robot's `servo_gap` [s]."""
+"""Time for which a servo may be behind its target by more than the robot's `Servos.gap` [s]."""
 CALM_S = 1.0
 """Time without any of this after which the trouble is over [s]."""
 
@@ -47,7 +49,7 @@ class Watch:
     The place where it stands follows its estimate slowly, so that one that drifts is no alarm.
 
     *Its servos give way.* A joint of the body that is behind its target by more than the robot's
-    `servo_gap` carries more than its motor can.
+    `Servos.gap` carries more than its motor can.
 
     Args:
         morphology: The robot.
@@ -71,7 +73,7 @@ class Watch:
             ],
             dtype=int,
         )
-        self._servo_gap = morphology.servo_gap
+        self._gap_limit = morphology.servos.gap if morphology.servos else math.inf
         self.reset()
 
     def reset(self) -> None:
@@ -105,7 +107,7 @@ class Watch:
 
     def _gives_way(self, qpos: np.ndarray, action: RobotAction) -> bool:
         gaps = np.abs(action.command[self._joints] - qpos[self._addresses])
-        behind = np.isfinite(self._servo_gap) and gaps.max(initial=0.0) > self._servo_gap
+        behind = gaps.max(initial=0.0) > self._gap_limit
         self._gap = self._gap + POLICY_DT if behind else 0.0
         return self._gap > GAP_S
 

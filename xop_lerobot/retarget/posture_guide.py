@@ -140,7 +140,7 @@ class PostureGuide:
             return
         still = configs[Mode.STATIONARY]
         # A chain of many joints has several postures for a goal; a waist on legs has one.
-        chain = self._morphology.has_stiff_body
+        chain = self._morphology.servos is not None
         self._searches[Mode.STATIONARY] = self._make_search(still, level=False, way=chain)
         self._free = self._make_search(still, level=False)
         self._level = self._make_search(still, level=True)

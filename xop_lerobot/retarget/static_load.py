@@ -105,10 +105,10 @@ def _cross_level(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def make_static_load(morphology: Morphology, model: mujoco.MjModel) -> StaticLoad | None:
     """What the servos of a stiff body bear; None where a policy moves the body."""
-    if not morphology.has_stiff_body:
+    if morphology.servos is None:
         return None
     joints = [effect.joint for effect in morphology.effects if effect.joint]
-    return StaticLoad(model, joints, morphology.load_share)
+    return StaticLoad(model, joints, morphology.servos.load_share)
 
 
 def _find_limits(model: mujoco.MjModel) -> dict[int, float]:

@@ -13,6 +13,7 @@ from xop_lerobot.morphology.morphology import (
     ArmChain,
     ModelKind,
     Morphology,
+    Servos,
     Variant,
     Work,
 )
@@ -128,12 +129,11 @@ class RBY1(Morphology):
     velocity_lag_s = 0.0
     pivot = PIVOT
     support = SUPPORT
-    has_stiff_body = True
     # A servo at its limit may rest anywhere.
     largest_offset = 1.0
     # Moving, its servos are behind by 0.05 rad, bending quickly by 0.2 for a moment; a torso that
     # folds leaves 0.3 to 1.5 for good.
-    servo_gap = 0.15
+    servos = Servos(gap=0.15)
     posture_limits = POSTURE_LIMITS
     standing_reach = STANDING_REACH
     driving = DRIVING

@@ -131,7 +131,7 @@ class SteadyBody:
     """
 
     def __init__(self, morphology: Morphology, model: mujoco.MjModel) -> None:
-        effects = morphology.effects if morphology.has_stiff_body else ()
+        effects = morphology.effects if morphology.servos else ()
         held = [i for i, effect in enumerate(effects) if effect.acts is Acts.JOINT]
         self._entries = np.array(held, dtype=int)
         joints = [model.joint(effects[i].joint) for i in held]
