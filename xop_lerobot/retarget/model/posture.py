@@ -270,4 +270,6 @@ class PostureSearch:
             return self.space.neutral
         count, second = _STARTS - 2, self._turn // _STARTS % 2
         starts = self._repertoire.choose(qpos[:7], goal, self.problem.weights, 2 * count)
+        if not len(starts):  # no posture that was drawn holds
+            return self.space.neutral
         return starts[(second * count + turn - 2) % len(starts)]
