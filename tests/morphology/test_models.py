@@ -1,4 +1,7 @@
-"""Every registered robot keeps the contract of a morphology, and its model behaves."""
+"""Every registered robot keeps the contract of a morphology, and its model behaves.
+
+The toys, of which one stands on feet and one on wheels, keep it too.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from functools import cache
 import mujoco
 import numpy as np
 import pytest
+import toy_robot  # noqa: F401  registers the toys
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import UnknownName
@@ -17,7 +21,15 @@ from xop_lerobot.core.transforms import quat_to_rpy, quat_yaw
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ModelKind, Morphology, make_morphology
 from xop_lerobot.morphology.scene import SCENES, build_model
 
-ROBOTS = ("g1", "rby1")
+ROBOTS = MORPHOLOGIES.built_in
+TOYS = ("toy", "rolling_toy")
+TOUCHING = {
+    "g1": {f"{side}_foot_{i}" for side in ("left", "right") for i in range(4)},
+    "rby1": {f"{s}_{part}" for s in ("left", "right") for part in ("wheel", "caster")},
+    "toy": {"sole"},
+    "rolling_toy": {f"{s}_{part}" for s in ("left", "right") for part in ("wheel", "caster")},
+}
+"""Geoms on which each robot stands."""
 KINDS: tuple[ModelKind, ...] = ("full", "planning")
 CAMERAS = ("head", "left_wrist", "right_wrist", "scene")
 SITES = ("head", "left_wrist", "right_wrist", "left_palm", "right_palm")
@@ -29,12 +41,11 @@ def model_of(robot: str, kind: ModelKind, scene: str = "empty") -> mujoco.MjMode
 
 
 def rest_control(morphology: Morphology, model: mujoco.MjModel) -> np.ndarray:
-    """Control that holds the standing posture: joints where they are, wheels still."""
+    """Control that holds the standing posture: position servos where they are, wheels still."""
     qpos, control = morphology.standing_qpos(), np.zeros(model.nu)
     for i in range(model.nu):
-        joint = model.joint(int(model.actuator_trnid[i, 0]))
-        if "wheel" not in joint.name:
-            control[i] = qpos[joint.qposadr[0]]
+        if model.actuator_biasprm[i, 1]:
+            control[i] = qpos[model.joint(int(model.actuator_trnid[i, 0])).qposadr[0]]
     return control
 
 
@@ -91,10 +102,17 @@ def test_unknown_names_list_the_choices() -> None:
 
 def test_both_robots_are_registered() -> None:
     make_morphology("g1")
-    assert set(ROBOTS) <= set(MORPHOLOGIES)
+    assert {"g1", "rby1"} <= set(MORPHOLOGIES)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", TOYS)
+def test_toys_leave_nothing_to_the_interface(robot: str) -> None:
+    """What no toy sets, no test would miss where generic code asks for one robot."""
+    own = {name for kind in type(make_morphology(robot)).__mro__[:-3] for name in vars(kind)}
+    assert set(Morphology.__annotations__) - own == set()
+
+
+@pytest.mark.parametrize("robot", (*ROBOTS, *TOYS))
 class TestContract:
     def test_full_and_planning_have_the_same_joints_and_actuators(self, robot: str) -> None:
         full, planning = model_of(robot, "full"), model_of(robot, "planning")
@@ -157,11 +175,7 @@ class TestContract:
             mujoco.mj_step(model, data)
             assert not self_contacts(model, data)
         touching = {geom for _, geom in contacts(model, data)}
-        expected = {
-            "g1": {f"{side}_foot_{i}" for side in ("left", "right") for i in range(4)},
-            "rby1": {f"{s}_{part}" for s in ("left", "right") for part in ("wheel", "caster")},
-        }
-        assert touching == expected[robot]
+        assert touching == TOUCHING[robot]
         assert abs(data.qpos[2] - height) < 0.005
         weight = 9.81 * mujoco.mj_getTotalmass(model)
         assert floor_force(model, data) == pytest.approx(weight, rel=0.15)
@@ -184,6 +198,9 @@ class TestContract:
             assert (palm - wrist) @ axes[:, 0] > 0.05
             assert wrist[1] * outwards > 0.05
 
+
+@pytest.mark.parametrize("robot", ROBOTS)
+class TestModels:
     def test_planning_model_is_bare(self, robot: str) -> None:
         model = model_of(robot, "planning")
         assert model.ncam == model.nlight == 0

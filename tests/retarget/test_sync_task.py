@@ -22,7 +22,7 @@ from xop_lerobot.retarget.sync.filters import (
 from xop_lerobot.retarget.sync.task import SyncTask
 
 
-class WheeledToy(toy_robot.Toy):
+class GlidingToy(toy_robot.Toy):
     """Wheels whose turning the model leaves out: their contact points are on the base."""
 
     contact_kind = Wheels()
@@ -32,7 +32,8 @@ MORPHOLOGIES = {
     "g1": lambda: make_morphology("g1"),
     "rby1": lambda: make_morphology("rby1"),
     "toy": toy_robot.Toy,
-    "wheeled toy": WheeledToy,
+    "rolling toy": toy_robot.RollingToy,
+    "gliding toy": GlidingToy,
 }
 
 
@@ -126,7 +127,7 @@ def test_residuals_are_those_of_the_paper():
     np.testing.assert_allclose(error, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["g1", "rby1", "toy"])
+@pytest.mark.parametrize("name", ["g1", "rby1", "toy", "rolling toy"])
 def test_the_ground_bears_the_weight_in_equilibrium(name):
     morphology = MORPHOLOGIES[name]()
     model = build_model(morphology, "planning")
