@@ -25,7 +25,7 @@ from xop_lerobot.core.transforms import (
     quat_to_rpy,
 )
 from xop_lerobot.low_level import policy_file
-from xop_lerobot.low_level.diff_drive import DiffDrive, compute_wheel_speeds
+from xop_lerobot.low_level.base_drive import DiffDrive, compute_wheel_speeds
 from xop_lerobot.low_level.factory import POLICIES, make_policy
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights

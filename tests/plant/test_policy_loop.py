@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.errors import BadShape, BadValue
-from xop_lerobot.low_level.diff_drive import DiffDrive
+from xop_lerobot.low_level.base_drive import DiffDrive
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy, PolicyOutput
 from xop_lerobot.morphology.limits import ARM_MAX_SPEED, limit_action
