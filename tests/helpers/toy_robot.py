@@ -25,6 +25,7 @@ from lerobot_robot_xop.xop_robot import XopRobot
 from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.core.state import RobotState
+from xop_lerobot.low_level.base_drive import BaseDrive
 from xop_lerobot.low_level.factory import POLICIES
 from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
 from xop_lerobot.morphology.contacts import Feet, Wheels
@@ -36,6 +37,7 @@ from xop_lerobot.morphology.morphology import (
     Morphology,
     Servos,
     Variant,
+    WheelDrive,
     Work,
 )
 from xop_lerobot.morphology.tuning import Driving, MpcConfig
@@ -154,6 +156,7 @@ class Toy(Morphology):
     velocity_lag_s = 0.2
     rest = None
     pivot = 0.0
+    drive = None
     driving = None
     support = ()
     servos = None
@@ -207,6 +210,7 @@ class RollingToy(Toy):
     velocity_lag_s = 0.0
     rest = None
     pivot = 0.1
+    drive = WheelDrive(0.1, {"left_wheel": (1, 0, -0.25), "right_wheel": (1, 0, 0.25)})
     driving = Driving(
         speed=0.8,
         acceleration=1.0,
@@ -246,9 +250,11 @@ class RollingToy(Toy):
         return MpcConfig(num_samples=8, horizon=5, noise_std=noise)
 
 
-class ToyPolicy(LowLevelPolicy):
-    """Counts its steps in its memory."""
+@POLICIES.register("toy_hold")
+class ToyHold(LowLevelPolicy):
+    """The mast goes where the command says, the arms where their targets are."""
 
+    name = "toy_hold"
     memory_size = 1
 
     def __init__(self, path: str | None = None) -> None:
@@ -257,13 +263,6 @@ class ToyPolicy(LowLevelPolicy):
     def initial_memory(self, n: int = 1) -> np.ndarray:
         return np.zeros((n, 1))
 
-
-@POLICIES.register("toy_hold")
-class ToyHold(ToyPolicy):
-    """The mast goes where the command says, the arms where their targets are."""
-
-    name = "toy_hold"
-
     def act(self, qpos, qvel, command, arms, memory, mode) -> PolicyOutput:
         del qpos, qvel, mode
         targets = np.concatenate([command[:, :1], arms], axis=1)
@@ -271,18 +270,13 @@ class ToyHold(ToyPolicy):
 
 
 @POLICIES.register("toy_roll")
-class ToyRoll(ToyPolicy):
-    """Wheel speeds by the kinematics, the rest as `ToyHold`."""
+class ToyRoll(BaseDrive):
+    """Wheels, mast and arms do as they are told."""
 
     name = "toy_roll"
 
-    def act(self, qpos, qvel, command, arms, memory, mode) -> PolicyOutput:
-        del qpos, qvel, mode
-        roll, turn = command[:, :1], 0.25 * command[:, 1:2]
-        targets = np.concatenate(
-            [(roll - turn) / 0.1, (roll + turn) / 0.1, command[:, 2:], arms], axis=1
-        )
-        return PolicyOutput(targets, memory + 1)
+    def __init__(self, path: str | None = None) -> None:
+        super().__init__(path, RollingToy())
 
 
 @RobotConfig.register_subclass("xop_toy")

@@ -25,7 +25,7 @@ from xop_lerobot.core.transforms import (
     quat_to_rpy,
 )
 from xop_lerobot.low_level import policy_file
-from xop_lerobot.low_level.base_drive import DiffDrive, compute_wheel_speeds
+from xop_lerobot.low_level.base_drive import DiffDrive
 from xop_lerobot.low_level.factory import POLICIES, make_policy
 from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.networks import LoadedNetwork, load_weights, save_weights
@@ -687,7 +687,11 @@ def test_benchmark_of_policies_writes_a_table(tmp_path: Path) -> None:
 
 def test_wheel_speeds_by_hand() -> None:
     """1 m/s forward is 10 rad/s on both wheels, backwards about their axes; turning differs."""
-    right, left = compute_wheel_speeds(np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    drive = make_morphology("rby1").drive
+    assert drive is not None
+    speeds = drive.compute_speeds(np.array([1.0, 0.0]), np.zeros(2), np.array([0.0, 1.0]))
+    right, left = speeds.T
+    assert list(drive.wheels) == ["right_wheel", "left_wheel"]
     np.testing.assert_allclose(right, [-10.0, -2.65])
     np.testing.assert_allclose(left, [-10.0, 2.65])
 

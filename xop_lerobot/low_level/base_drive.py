@@ -1,4 +1,4 @@
-"""The low-level controller of a robot with two driven wheels, a torso and arms: RB-Y1."""
+"""Low-level controllers of robots on driven wheels, whose torso and arms are on servos."""
 
 from __future__ import annotations
 
@@ -9,55 +9,33 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadShape, PolicyFileError
 from xop_lerobot.low_level.policy import LowLevelPolicy, PolicyOutput
+from xop_lerobot.morphology.effect import Acts
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
 
-TRACK = 0.53
-"""Distance between the wheels [m]."""
 
-WHEEL_RADIUS = 0.1
-"""Radius of the wheels [m]."""
-
-
-def compute_wheel_speeds(v: np.ndarray, yaw_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Compute wheel speeds of a differential drive whose wheels turn about −Y.
-
-    .. math:: \omega_{r,l} = -(v \pm \tfrac{1}{2} b\,\Omega) / r
-
-    Args:
-        v: Forward velocity [m/s]. Shape (n,).
-        yaw_rate: Yaw rate Ω [rad/s]. Shape (n,).
-
-    Returns:
-        Speeds of the right and of the left wheel [rad/s]. Shapes (n,).
-    """
-    half = 0.5 * TRACK * yaw_rate
-    return -(v + half) / WHEEL_RADIUS, -(v - half) / WHEEL_RADIUS
-
-
-class DiffDrive(LowLevelPolicy):
-    """Wheel speeds by the kinematics; torso, arms and grippers by their targets.
+class BaseDrive(LowLevelPolicy):
+    """Wheel speeds by the robot's `WheelDrive`; torso, arms and grippers by their targets.
 
     The servos are in the model: a torque proportional to the speed error at the wheels,
-    position control and gravity compensation at the joints. Which target goes where is found by
-    name: an actuator takes the command entry of its name, else the arm target of its name, else
-    zero (the head looks straight ahead). Targets are clipped to the actuators' ranges.
+    position control at the joints. Which target goes where is found by name: an actuator takes the
+    command entry of its name, else the arm target of its name, else zero (the head looks straight
+    ahead). Targets are clipped to the actuators' ranges.
 
     Args:
         path: Must be None, this controller has no file.
-        morphology: The robot, None for RB-Y1.
+        morphology: The robot; None for the one of this project that has a policy of this name.
 
     Raises:
         PolicyFileError: If a path is given.
     """
 
-    name = "diff_drive"
     memory_size = 0
 
     def __init__(self, path: str | None = None, morphology: Morphology | None = None) -> None:
         if path is not None:
-            raise PolicyFileError(f"low-level policy 'diff_drive' has no file, got '{path}'")
+            raise PolicyFileError(f"low-level policy '{self.name}' has no file, got '{path}'")
         if morphology is None:
             from xop_lerobot.morphology.morphology import MORPHOLOGIES  # noqa: PLC0415
 
@@ -67,9 +45,12 @@ class DiffDrive(LowLevelPolicy):
         actuators = [model.actuator(i).name for i in range(model.nu)]
         commands, arms = morphology.command_space.names, morphology.arm_names
         self._sizes = model.nq, model.nv, len(commands), len(arms)
-        self._wheels = actuators.index("right_wheel"), actuators.index("left_wheel")
-        drive = ("v", "yaw_rate")
-        self._drive = tuple(commands.index(name) if name in commands else None for name in drive)
+        assert morphology.drive is not None, f"the wheels of {morphology.name} are not known"
+        self._drive = morphology.drive
+        self._wheels = [actuators.index(name) for name in self._drive.wheels]
+        acts = [effect.acts for effect in morphology.effects]
+        twist = (Acts.FORWARD, Acts.LEFT, Acts.TURN)
+        self._twist = tuple(acts.index(each) if each in acts else None for each in twist)
         self._from_command = _pairs(actuators, commands)
         self._from_arms = _pairs(actuators, [a for a in arms if a not in commands], arms)
         limited = model.actuator_ctrllimited.astype(bool)
@@ -100,11 +81,17 @@ class DiffDrive(LowLevelPolicy):
             if np.shape(array) != (n, size):
                 raise BadShape(name, (n, size), np.shape(array))
         targets = np.zeros((n, len(self._low)))
-        v, yaw_rate = (np.zeros(n) if i is None else command[:, i] for i in self._drive)
-        targets[:, self._wheels[0]], targets[:, self._wheels[1]] = compute_wheel_speeds(v, yaw_rate)
+        twist = [np.zeros(n) if i is None else command[:, i] for i in self._twist]
+        targets[:, self._wheels] = self._drive.compute_speeds(*twist)
         targets[:, self._from_command[0]] = command[:, self._from_command[1]]
         targets[:, self._from_arms[0]] = arms[:, self._from_arms[1]]
         return PolicyOutput(np.clip(targets, self._low, self._high, out=targets), np.zeros((n, 0)))
+
+
+class DiffDrive(BaseDrive):
+    """Two driven wheels on one axle: RB-Y1."""
+
+    name = "diff_drive"
 
 
 def _pairs(

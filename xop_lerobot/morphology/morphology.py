@@ -97,6 +97,38 @@ class Servos:
     load_share: float = 0.75
 
 
+@dataclass(frozen=True)
+class WheelDrive:
+    r"""Kinematics of the driven wheels: :math:`\omega = (f v_x + s v_y + t \Omega) / r` for each.
+
+    Attributes:
+        radius: Radius of the wheels r [m].
+        wheels: f [1], s [1] and t [m] by the motor of the wheel. f and s are the shares of the
+            forward and the sideways velocity, negative where a wheel turns backwards for them.
+    """
+
+    radius: float
+    wheels: Mapping[str, tuple[float, float, float]]
+
+    @cached_property
+    def _shares(self) -> np.ndarray:
+        return np.array(list(self.wheels.values())).T
+
+    def compute_speeds(self, forward: np.ndarray, left: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """Speeds of the wheels [rad/s], in the order of `wheels`.
+
+        Args:
+            forward: Forward velocity [m/s]. Shape (n,).
+            left: Velocity to the left [m/s]. Shape (n,).
+            turn: Yaw rate [rad/s]. Shape (n,).
+
+        Returns:
+            Shape (n, wheels).
+        """
+        f, s, t = self._shares
+        return (forward[:, None] * f + turn[:, None] * t + left[:, None] * s) / self.radius
+
+
 class Morphology(ABC):
     """A robot, as far as retargeting is concerned. One folder per robot, no other code knows it.
 
@@ -144,6 +176,8 @@ class Morphology(ABC):
     None for a base that does not, or of which that is not known."""
     pivot: float = 0.0
     """Forward distance from the base's frame to its centre of turning [m]."""
+    drive: WheelDrive | None = None
+    """How its driven wheels turn; None for a base without any."""
     driving: Driving | None = None
     """How it drives along a path; None for a base that goes to any side."""
     support: tuple[tuple[float, float], ...] = ()

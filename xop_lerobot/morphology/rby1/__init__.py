@@ -15,6 +15,7 @@ from xop_lerobot.morphology.morphology import (
     Morphology,
     Servos,
     Variant,
+    WheelDrive,
     Work,
 )
 from xop_lerobot.morphology.rby1.links import LINKS
@@ -29,6 +30,7 @@ from xop_lerobot.morphology.rby1.mpc import (
     V2_CONFIG,
     mpc_config,
 )
+from xop_lerobot.morphology.rby1.shapes import TRACK, WHEEL_RADIUS
 from xop_lerobot.morphology.tuning import PaperParameters
 
 if TYPE_CHECKING:
@@ -136,6 +138,10 @@ class RBY1(Morphology):
     servos = Servos(gap=0.15)
     posture_limits = POSTURE_LIMITS
     standing_reach = STANDING_REACH
+    # The wheels turn about -Y.
+    drive = WheelDrive(
+        WHEEL_RADIUS, {"right_wheel": (-1, 0, -0.5 * TRACK), "left_wheel": (-1, 0, 0.5 * TRACK)}
+    )
     driving = DRIVING
     point_heights, top_heights = (0.25, 1.5), (0.3, 1.3)
     # Between the fingers of its hand is a gap, through which a toy would fall.
