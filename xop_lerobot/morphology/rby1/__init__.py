@@ -55,7 +55,7 @@ GRIPPER_OPEN = 0.05
 """Opening of one finger [m]."""
 
 
-def _make_torso_dims() -> tuple[CommandDim, ...]:
+def make_torso_dims() -> tuple[CommandDim, ...]:
     """Return the torso's command entries, with the limits of the joint table."""
     joints = {link.joint.name: link.joint for link in LINKS if link.joint is not None}
     dims = []
@@ -87,7 +87,7 @@ class RBY1(Morphology):
                 mobile_only=True,
                 max_accel=100.0,
             ),
-            *_make_torso_dims(),
+            *make_torso_dims(),
         )
     )
     policies = ("diff_drive",)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from xop_lerobot.morphology import links as rows
-from xop_lerobot.morphology.links import FLOOR_BIT, Joint
+from xop_lerobot.morphology.links import FLOOR_BIT, Frame, Joint, Link, Shape
 from xop_lerobot.morphology.rby1 import shapes
 from xop_lerobot.morphology.rby1.links import LINKS
 
@@ -49,8 +50,11 @@ HEAD_GAINS = (200.0, 7.0)
 FINGER_GAINS = (1500.0, 60.0)
 """k_p [N/m], k_d [N s/m]: 75 N when an opening of 5 cm is blocked shut."""
 
-DRIVEN_FINGERS = {"gripper_finger_r2": "right_gripper", "gripper_finger_l2": "left_gripper"}
-"""Fingers with a motor, and the motor's name; the other finger of a hand mirrors it."""
+GRIPPERS = {
+    "left_gripper": ("gripper_finger_l2", "gripper_finger_l1"),
+    "right_gripper": ("gripper_finger_r2", "gripper_finger_r1"),
+}
+"""Motors of the hands: the finger that each drives, and the other one, which mirrors it."""
 
 
 def compute_gains(joint: Joint) -> tuple[float, float]:
@@ -67,30 +71,48 @@ def compute_gains(joint: Joint) -> tuple[float, float]:
 
 
 def build_rby1(kind: str) -> mujoco.MjSpec:
-    """Build RB-Y1 alone.
+    """Build RB-Y1 alone; see `build_on_base`."""
+    return build_on_base("rby1", kind, LINKS, GRIPPERS, shapes.SHAPES, shapes.SITES, add_wheels)
 
-    The planning model has wheels and casters alone, which meet the floor, no visuals, no
-    cameras.
+
+def build_on_base(
+    name: str,
+    kind: str,
+    links: Sequence[Link],
+    grippers: Mapping[str, tuple[str, str]],
+    looks: Sequence[Shape],
+    sites: Sequence[Frame],
+    add_base: Callable[[mujoco.MjSpec], None],
+) -> mujoco.MjSpec:
+    """Build a robot with the upper body of RB-Y1 on some base.
+
+    The planning model has what stands on the floor alone, no visuals, no cameras.
 
     Args:
+        name: Name of the model.
         kind: ``"full"`` or ``"planning"``.
+        links: Its links.
+        grippers: As `GRIPPERS`.
+        looks: What collides and is seen.
+        sites: Its named frames.
+        add_base: Adds what stands on the floor.
     """
     import mujoco  # noqa: PLC0415
 
     planning = kind == "planning"
-    spec = rows.new_spec("rby1", TIMESTEP)
+    spec = rows.new_spec(name, TIMESTEP)
     # The servos' damping is taken implicitly, which keeps stiff joints stable at this step.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    rows.add_links(spec, LINKS, "base_joint")
-    for link in LINKS:
-        if link.joint is not None:
-            add_motor(spec, link.joint)
-    add_grippers(spec)
-    rows.add_sites(spec, shapes.SITES)
-    add_wheels(spec)
+    rows.add_links(spec, links, "base_joint")
+    joints = {link.joint.name: link.joint for link in links if link.joint is not None}
+    for joint in joints.values():
+        add_motor(spec, joint)
+    add_grippers(spec, joints, grippers)
+    rows.add_sites(spec, sites)
+    add_base(spec)
     if not planning:
         rows.add_materials(spec, shapes.MATERIALS)
-        rows.add_shapes(spec, shapes.SHAPES)
+        rows.add_shapes(spec, looks)
         for first, second in shapes.EXCLUDED:
             spec.add_exclude(bodyname1=first, bodyname2=second)
         rows.add_camera(spec, shapes.HEAD_CAMERA, shapes.HEAD_FOVY)
@@ -121,14 +143,14 @@ def add_motor(spec: mujoco.MjSpec, row: Joint) -> None:
         rows.add_servo(spec, row, *compute_gains(row))
 
 
-def add_grippers(spec: mujoco.MjSpec) -> None:
+def add_grippers(
+    spec: mujoco.MjSpec, joints: Mapping[str, Joint], grippers: Mapping[str, tuple[str, str]]
+) -> None:
     """Add one motor a hand, whose target is the opening of one finger [m]."""
     import mujoco  # noqa: PLC0415
 
-    joints = {link.joint.name: link.joint for link in LINKS if link.joint is not None}
-    for driven, name in sorted(DRIVEN_FINGERS.items()):
+    for name, (driven, mirrored) in grippers.items():
         rows.add_servo(spec, joints[driven], *FINGER_GAINS, name=name)
-        mirrored = driven[:-1] + "1"
         equality = spec.add_equality(
             name=name,
             type=mujoco.mjtEq.mjEQ_JOINT,
