@@ -26,12 +26,13 @@ from typing import Any
 
 import numpy as np
 
+from xop_lerobot.morphology.morphology import list_robots
+
 CODE = "BENCHMARK"
 SPAWN = multiprocessing.get_context("spawn")
 OPEN_S, GESTURE_S = 1.2, 2.0
 """Hands are open at first, then the gesture is held."""
 LEVEL, TURNED = [0.0, 0, 0, 1], [0.0, 0, 1, 0]
-POLICIES = {"g1": "default", "rby1": "diff_drive"}
 
 
 def make_message(number: int, t: float) -> dict[str, Any]:
@@ -184,7 +185,7 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
     from xop_lerobot.retarget.config import RetargeterConfig
     from xop_lerobot.teleoperation import TeleoperationConfig
 
-    low_level, fps = POLICIES[settings.robot], settings.fps
+    fps = settings.fps
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     plant = Simulation(make_morphology(settings.robot), SimulationConfig(), kind="planning")
@@ -192,7 +193,7 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
         device=DeviceConfig(type="measured", port=port, code=CODE, max_delay_s=5.0, stale_s=1.0),
         retargeter=RetargeterConfig(type=settings.retargeter),
     )
-    with closed_loop(plant, config, low_level, fps=fps, realtime=True) as (loop, teleoperation):
+    with closed_loop(plant, config, fps=fps, realtime=True) as (loop, teleoperation):
         teleoperation.connect()
         loop.reset(seed=0, settle_s=0.8)
         device: Any = teleoperation.device
@@ -223,7 +224,7 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--robot", choices=list(POLICIES), default="g1")
+    parser.add_argument("--robot", choices=list_robots(), default="g1")
     parser.add_argument("--retargeter", choices=["direct", "mpc"], default="direct")
     parser.add_argument("--fps", type=int, default=25, help="rate of the control loop [Hz]")
     parser.add_argument("--sender", choices=["program", "browser"], default="program")

@@ -26,7 +26,7 @@ from xop_lerobot.core.transforms import (
     rotation_error,
 )
 from xop_lerobot.evaluation.trial import closed_loop
-from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.morphology import make_morphology, say_robots
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.plant.config import SimulationConfig
@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--robot", default="rby1", help="g1 or rby1 (default: rby1)")
+    parser.add_argument("--robot", default="rby1", help=f"{say_robots()} (default: rby1)")
     parser.add_argument("--goals", type=int, default=20, help="number of goals (default: 20)")
     parser.add_argument("--hold", type=float, default=6.0, help="time for each [s] (default: 6)")
     parser.add_argument("--noise", default="off", help="sensor noise (default: off)")

@@ -3,7 +3,7 @@
     python -m benchmarks.run_tracking --robot g1 --scenarios squat,yaw --seeds 3 --jobs 1
     python -m benchmarks.run_tracking --robot rby1 --scenarios diagonal --plot diagonal.png
     python -m benchmarks.run_tracking --robot g1 --set mobile.horizon=20 --scenarios mobile
-    python -m benchmarks.run_tracking --robot both --scenarios all --hold 60 --seeds 10 \
+    python -m benchmarks.run_tracking --robot all --scenarios all --hold 60 --seeds 10 \
         --ablations default,table1 --jobs 2 --json outputs/tracking.json
     python -m benchmarks.run_tracking --json outputs/tracking.json --write-docs
 
@@ -40,7 +40,7 @@ from benchmarks.tracking_setup import (
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import UnknownName, XopError
 from xop_lerobot.core.pool import run_jobs
-from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.morphology import list_robots, make_morphology, say_robots
 
 ROOT = Path(__file__).resolve().parent.parent
 GROUPS = {
@@ -57,7 +57,7 @@ def parse_args(arguments: list[str] | None = None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("--robot", default="g1", help="g1, rby1 or both (default: g1)")
+    add("--robot", default="g1", help=f"{say_robots()}, or all (default: g1)")
     add("--scenarios", default="all", help=f"names with commas: {', '.join(SCENARIOS)}; or "
         f"{', '.join(GROUPS)} (default: all, which leaves out room and arms)")  # fmt: skip
     add("--ablations", default="default", help=f"names with commas, or all: {', '.join(ABLATIONS)}")
@@ -100,7 +100,7 @@ def make_setups(args: argparse.Namespace) -> list[TrackingSetup]:
     Raises:
         UnknownName: If a robot, scenario or ablation is unknown.
     """
-    robots = ("g1", "rby1") if args.robot == "both" else (args.robot,)
+    robots = list_robots() if args.robot == "all" else (args.robot,)
     scenarios = [name for each in args.scenarios.split(",") for name in GROUPS.get(each, (each,))]
     for name in scenarios:
         if name not in SCENARIOS:

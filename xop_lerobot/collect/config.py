@@ -27,7 +27,7 @@ class CollectConfig:
     """Everything that determines a dataset's content; equal configurations give equal episodes.
 
     Attributes:
-        robot: Name of the robot's morphology, `g1` or `rby1`.
+        robot: Name of the robot's morphology, `g1` for one.
         task: Name of the task.
         seed: Seed of the session; with the episode's index it decides all that is random.
         cameras: Cameras that are recorded.

@@ -61,8 +61,21 @@ class RobotJoints:
 
     @classmethod
     def of(cls, morphology: Morphology) -> RobotJoints:
-        """Read the joints from a robot's planning model."""
+        """Read the joints from a robot's planning model.
+
+        Raises:
+            BadValue: If it has motors that turn no joint.
+        """
+        import mujoco  # noqa: PLC0415
+
         model = morphology.build_spec("planning").compile()
+        others = np.flatnonzero(model.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT)
+        if len(others):
+            names = ", ".join(model.actuator(i).name for i in others)
+            raise BadValue(
+                f"robot '{morphology.name}' has motors that turn no joint, which no table drives: "
+                f"{names}"
+            )
         ids = model.actuator_trnid[:, 0]
         names = tuple(model.joint(joint).name for joint in ids)
         commands, arms = morphology.command_space.names, morphology.arm_names

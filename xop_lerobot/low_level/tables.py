@@ -17,7 +17,7 @@ from xop_lerobot.low_level.network_policy import MotorSet, NetworkPolicy, Stage
 from xop_lerobot.low_level.network_stage import NetworkStage
 from xop_lerobot.low_level.networks import LoadedNetwork, ReferenceNetwork, load_network
 from xop_lerobot.low_level.policy_file import FileFinder
-from xop_lerobot.morphology.morphology import list_robots
+from xop_lerobot.morphology.morphology import list_robots, make_morphology
 
 logger = logging.getLogger(__name__)
 
@@ -92,8 +92,10 @@ def _name_robot(names: tuple[str, ...]) -> str:
     Raises:
         ValueError: If none has.
     """
+    from xop_lerobot.morphology.body import Body  # noqa: PLC0415  brings MuJoCo
+
     for robot in list_robots():
-        if set(names) <= set(read_joints(robot).names):
+        if set(names) <= set(Body(make_morphology(robot)).joint_names):
             return robot
     raise ValueError(f"names joints that no robot has: {', '.join(names)}")
 

@@ -253,13 +253,23 @@ class Morphology(ABC):
 
 
 MORPHOLOGIES: Registry[type[Morphology]] = Registry(
-    "robot", {"g1": "xop_lerobot.morphology.g1:G1", "rby1": "xop_lerobot.morphology.rby1:RBY1"}
+    "robot",
+    {
+        "g1": "xop_lerobot.morphology.g1:G1",
+        "rby1": "xop_lerobot.morphology.rby1:RBY1",
+    },
 )
 
 
 def list_robots() -> tuple[str, ...]:
     """Names of the known robots."""
     return tuple(MORPHOLOGIES)
+
+
+def say_robots() -> str:
+    """Names of this project's robots, as a help text lists them: ``"g1, rby1 or rby1m"``."""
+    *others, last = MORPHOLOGIES.built_in
+    return f"{', '.join(others)} or {last}"
 
 
 def list_robot_types() -> str:

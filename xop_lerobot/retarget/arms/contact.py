@@ -203,7 +203,8 @@ class ArmLoad:
         self._data = mujoco.MjData(self._model)
         self._jacobian = np.zeros((3, self._model.nv))
         self._arms = []
-        driven = self._model.actuator_trnid[:, 0].tolist()
+        on_joint = self._model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        driven = np.where(on_joint, self._model.actuator_trnid[:, 0], -1).tolist()
         for arm in morphology.arms:
             joints = [self._model.joint(joint) for joint in arm.joints]
             site = self._model.site(morphology.frames[arm.frame]).id
