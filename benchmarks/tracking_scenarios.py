@@ -138,7 +138,7 @@ class Scenario:
 STATIONARY_TOLERANCE = {"": Tolerance(0.02, math.radians(3))}
 MOBILE_TOLERANCE = {
     "": Tolerance(0.05, math.radians(3)),
-    "rby1": Tolerance(0.02, math.radians(1)),
+    **dict.fromkeys(("rby1", "rby1m"), Tolerance(0.02, math.radians(1))),
 }
 
 

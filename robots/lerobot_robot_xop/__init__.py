@@ -1,4 +1,4 @@
-"""LeRobot robots `xop_g1` and `xop_rby1`, driven by whole-body commands through a policy.
+"""LeRobot robots `xop_g1`, `xop_rby1` and `xop_rby1m`, driven by whole-body commands.
 
 Importing this package registers the configurations alone. The device classes bring MuJoCo, so
 they are loaded when they are first asked for.
@@ -13,11 +13,12 @@ from lerobot_robot_xop.config_xop import (
     SceneConfig,
     XopG1Config,
     XopRby1Config,
+    XopRby1MConfig,
     XopRobotConfig,
 )
 
 if TYPE_CHECKING:
-    from lerobot_robot_xop.xop_robot import XopG1, XopRby1, XopRobot
+    from lerobot_robot_xop.xop_robot import XopG1, XopRby1, XopRby1M, XopRobot
 
 __all__ = [
     "LowLevelConfig",
@@ -26,11 +27,13 @@ __all__ = [
     "XopG1Config",
     "XopRby1",
     "XopRby1Config",
+    "XopRby1M",
+    "XopRby1MConfig",
     "XopRobot",
     "XopRobotConfig",
 ]
 
-_DEVICES = ("XopG1", "XopRby1", "XopRobot")
+_DEVICES = ("XopG1", "XopRby1", "XopRby1M", "XopRobot")
 
 
 def __getattr__(name: str) -> object:

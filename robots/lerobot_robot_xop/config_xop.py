@@ -147,3 +147,11 @@ class XopRby1Config(XopRobotConfig):
     """Rainbow Robotics RB-Y1 on two wheels."""
 
     morphology: ClassVar[str] = "rby1"
+
+
+@RobotConfig.register_subclass("xop_rby1m")
+@dataclass(kw_only=True)
+class XopRby1MConfig(XopRobotConfig):
+    """Rainbow Robotics RB-Y1 M on four mecanum wheels."""
+
+    morphology: ClassVar[str] = "rby1m"

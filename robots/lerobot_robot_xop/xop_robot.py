@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from lerobot.robots.robot import Robot
 
-from lerobot_robot_xop.config_xop import XopG1Config, XopRby1Config, XopRobotConfig
+from lerobot_robot_xop.config_xop import (
+    XopG1Config,
+    XopRby1Config,
+    XopRby1MConfig,
+    XopRobotConfig,
+)
 from xop_lerobot.core.command_line import report_mistakes
 from xop_lerobot.core.errors import NotConnected, UnknownName
 from xop_lerobot.low_level.factory import make_policy, resolve_policy
@@ -248,3 +253,10 @@ class XopRby1(XopRobot):
 
     config_class = XopRby1Config
     name = "xop_rby1"
+
+
+class XopRby1M(XopRobot):
+    """Rainbow Robotics RB-Y1 M."""
+
+    config_class = XopRby1MConfig
+    name = "xop_rby1m"

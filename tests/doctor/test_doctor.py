@@ -85,8 +85,8 @@ def test_children_may_crash_and_hang():
 
 def test_plugin(monkeypatch):
     known: dict = {
-        "robots": ["xop_g1", "xop_rby1"], "teleoperators": ["xop"], "patches": 15, "refused": [],
-        "warned": [],
+        "robots": ["xop_g1", "xop_rby1", "xop_rby1m"], "teleoperators": ["xop"], "patches": 15,
+        "refused": [], "warned": [],
     }  # fmt: skip
 
     def answer(ok: bool, value: object) -> Finding:
@@ -97,9 +97,9 @@ def test_plugin(monkeypatch):
     fine = answer(True, known)
     assert (fine.level, fine.text) == (
         Level.OK,
-        f"LeRobot {LEROBOT} knows xop_g1, xop_rby1 and the teleoperator xop; all 15 patches fit it",
+        f"LeRobot {LEROBOT} knows xop_g1, xop_rby1, xop_rby1m and the teleoperator xop; all 15 patches fit it",
     )
-    missing = answer(True, known | {"robots": ["xop_g1"], "teleoperators": []})
+    missing = answer(True, known | {"robots": ["xop_g1", "xop_rby1m"], "teleoperators": []})
     assert (missing.level, missing.text) == (Level.FAIL, "LeRobot does not know xop_rby1, xop")
     assert (
         answer(False, "ImportError: torch").text == "LeRobot cannot be loaded: ImportError: torch"

@@ -17,7 +17,7 @@ import toy_robot  # noqa: F401  registers the toys
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import UnknownName
-from xop_lerobot.core.transforms import quat_to_rpy, quat_yaw
+from xop_lerobot.core.transforms import quat_conjugate, quat_rotate, quat_to_rpy, quat_yaw
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, ModelKind, Morphology, make_morphology
 from xop_lerobot.morphology.scene import SCENES, build_model
 
@@ -26,6 +26,7 @@ TOYS = ("toy", "rolling_toy")
 TOUCHING = {
     "g1": {f"{side}_foot_{i}" for side in ("left", "right") for i in range(4)},
     "rby1": {f"{s}_{part}" for s in ("left", "right") for part in ("wheel", "caster")},
+    "rby1m": {f"{e}_{s}_wheel" for e in ("front", "rear") for s in ("left", "right")},
     "toy": {"sole"},
     "rolling_toy": {f"{s}_{part}" for s in ("left", "right") for part in ("wheel", "caster")},
 }
@@ -359,3 +360,68 @@ class TestRby1:
             assert first == pytest.approx(-opening, abs=0.002)
         span = data.body(f"ee_finger_{letter}1").xpos - data.body(f"ee_finger_{letter}2").xpos
         assert np.linalg.norm(span) == pytest.approx(2 * 0.03 + 0.006, abs=0.003)
+
+
+class TestRby1M:
+    def drive(self, **command: float) -> tuple[np.ndarray, np.ndarray]:
+        """Speed up at the largest rate and hold for 3 s.
+
+        Returns:
+            Velocity of the base at the end, in its own axes: forward, left, yaw rate. Shape (3,).
+            The largest roll and pitch on the way [rad]. Shape (2,).
+        """
+        morphology = make_morphology("rby1m")
+        model, data = standing("rby1m", "full")
+        assert morphology.drive is not None
+        motors = [model.actuator(name).id for name in morphology.drive.wheels]
+        space, tilt = morphology.command_space, np.zeros(2)
+        wanted = space.neutral.copy()
+        for name, value in command.items():
+            wanted[space.index(name)] = value
+        for i in range(600):
+            reach = space.max_rate * (i + 1) * model.opt.timestep
+            twist = np.clip(wanted, -reach, reach)[:3, None]
+            data.ctrl[motors] = morphology.drive.compute_speeds(*twist)[0]
+            mujoco.mj_step(model, data)
+            tilt = np.maximum(tilt, np.abs(quat_to_rpy(data.qpos[3:7])[:2]))
+        velocity = quat_rotate(quat_conjugate(data.qpos[3:7]), data.qvel[:3])
+        return np.array([*velocity[:2], data.qvel[5]]), tilt
+
+    @pytest.mark.parametrize(
+        "command",
+        [
+            {"vx": 0.5},
+            {"vy": 0.5},
+            {"vy": -0.5},
+            {"yaw_rate": 0.8},
+            {"vx": -0.4, "vy": 0.3, "yaw_rate": 0.5},
+        ],
+    )
+    def test_drives_to_any_side_and_stays_level(self, command: dict[str, float]) -> None:
+        velocity, tilt = self.drive(**command)
+        expected = [command.get(name, 0.0) for name in ("vx", "vy", "yaw_rate")]
+        # It turns about the middle of the wheels, 2 mm behind the base.
+        assert velocity == pytest.approx(expected, abs=0.003)
+        assert tilt.max() < 0.005
+
+    def test_stands_still(self) -> None:
+        model, data = standing("rby1m", "full")
+        for _ in range(2000):
+            mujoco.mj_step(model, data)
+        assert np.linalg.norm(data.qpos[:2]) < 1e-4
+        assert abs(quat_yaw(data.qpos[3:7])) < 1e-4
+        assert np.abs(data.qvel).max() < 1e-3
+        torso = make_morphology("rby1m").command_space.neutral[3:]
+        assert np.abs(data.qpos[7:13] - torso).max() < 0.005
+
+    def test_wheel_speeds_are_those_of_the_motors(self) -> None:
+        """The speed that a motor feels is the one that the drive asks for, once it is reached."""
+        model, data = standing("rby1m", "planning")
+        morphology = make_morphology("rby1m")
+        assert morphology.drive is not None
+        data.qvel[:6] = (0.3, -0.2, 0, 0, 0, 0.4)
+        mujoco.mj_forward(model, data)
+        twist = [np.array([value]) for value in (0.3, -0.2, 0.4)]
+        wanted = morphology.drive.compute_speeds(*twist)[0]
+        felt = [data.actuator(name).velocity[0] for name in morphology.drive.wheels]
+        assert felt == pytest.approx(wanted, abs=0.02)

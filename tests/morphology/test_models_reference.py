@@ -19,6 +19,7 @@ from xop_lerobot.morphology.rby1.links import PLACEHOLDER
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[3] / "shared"))
 G1_XML = SHARED / "reference" / "g1" / "g1_29dof_kinematics.xml"
 RBY1_URDF = SHARED / "reference" / "rby1" / "rby1a_v1.2.urdf"
+RBY1M_URDF = SHARED / "reference" / "rby1m" / "rby1m_v1.3.urdf"
 POSTURES = 20
 POSITION_TOLERANCE = 1e-3
 """[m]"""
@@ -169,10 +170,12 @@ class Urdf:
         inertial = get_child(self.links[name], "inertial")
         origin, tensor = get_child(inertial, "origin"), get_child(inertial, "inertia")
         keys = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
-        inertia = np.array([float(get_text(tensor, key)) for key in keys])
-        assert not self.vector(origin, "rpy").any()
+        inertia = np.array([float(get_text(tensor, key)) for key in keys]).reshape(3, 3)
+        axes = np.zeros(9)
+        mujoco.mju_quat2Mat(axes, quat_from_rpy(*self.vector(origin, "rpy")))
+        axes = axes.reshape(3, 3)
         com, mass = self.vector(origin, "xyz"), get_text(get_child(inertial, "mass"), "value")
-        return LinkNumbers(float(mass), com, inertia.reshape(3, 3))
+        return LinkNumbers(float(mass), com, axes @ inertia @ axes.T)
 
     def frames(
         self, base: tuple[np.ndarray, np.ndarray], angles: Mapping[str, float]
@@ -204,6 +207,28 @@ class Urdf:
         return poses, axes
 
 
+def check_frames(model: mujoco.MjModel, urdf: Urdf) -> None:
+    """Every link is where the description has it, at random postures."""
+    rng = np.random.default_rng(0)
+    data = mujoco.MjData(model)
+    matrix = np.zeros(9)
+    for _ in range(POSTURES):
+        data.qpos[:] = random_posture(model, rng)
+        mujoco.mj_kinematics(model, data)
+        angles = {
+            model.joint(i).name: data.qpos[model.jnt_qposadr[i]] for i in range(1, model.njnt)
+        }
+        frames = urdf.frames((data.qpos[:3].copy(), data.qpos[3:7].copy()), angles)
+        assert len(frames) == model.nbody - 2
+        for link, (pos, quat, axis) in frames.items():
+            body = model.body(link)
+            assert np.linalg.norm(data.body(link).xpos - pos) < POSITION_TOLERANCE, link
+            mujoco.mju_quat2Mat(matrix, quat)
+            check_rotation(data.body(link).xmat.reshape(3, 3), matrix.reshape(3, 3), link)
+            if body.jntnum[0]:
+                check_rotation(data.xaxis[body.jntadr[0]], axis / np.linalg.norm(axis), link)
+
+
 @pytest.fixture(scope="module")
 def urdf() -> Urdf:
     return Urdf(RBY1_URDF)
@@ -212,24 +237,7 @@ def urdf() -> Urdf:
 @pytest.mark.skipif(not RBY1_URDF.exists(), reason=f"no reference description at {RBY1_URDF}")
 class TestRby1:
     def test_joint_frames_at_random_postures(self, rby1: mujoco.MjModel, urdf: Urdf) -> None:
-        rng = np.random.default_rng(0)
-        data = mujoco.MjData(rby1)
-        matrix = np.zeros(9)
-        for _ in range(POSTURES):
-            data.qpos[:] = random_posture(rby1, rng)
-            mujoco.mj_kinematics(rby1, data)
-            angles = {
-                rby1.joint(i).name: data.qpos[rby1.jnt_qposadr[i]] for i in range(1, rby1.njnt)
-            }
-            frames = urdf.frames((data.qpos[:3].copy(), data.qpos[3:7].copy()), angles)
-            assert len(frames) == rby1.nbody - 2
-            for link, (pos, quat, axis) in frames.items():
-                body = rby1.body(link)
-                assert np.linalg.norm(data.body(link).xpos - pos) < POSITION_TOLERANCE, link
-                mujoco.mju_quat2Mat(matrix, quat)
-                check_rotation(data.body(link).xmat.reshape(3, 3), matrix.reshape(3, 3), link)
-                if body.jntnum[0]:
-                    check_rotation(data.xaxis[body.jntadr[0]], axis / np.linalg.norm(axis), link)
+        check_frames(rby1, urdf)
 
     def test_limits(self, rby1: mujoco.MjModel, urdf: Urdf) -> None:
         efforts = {
@@ -270,3 +278,65 @@ class TestRby1:
         assert wheels[0][2] == pytest.approx(radius)
         middle = float(get_text(mobile, "xyz").split()[0])
         assert np.mean(wheels, axis=0)[0] == pytest.approx(middle)
+
+
+@pytest.fixture(scope="module")
+def rby1m() -> mujoco.MjModel:
+    return make_morphology("rby1m").build_spec("full").compile()
+
+
+@pytest.fixture(scope="module")
+def urdf_m() -> Urdf:
+    return Urdf(RBY1M_URDF)
+
+
+@pytest.mark.skipif(not RBY1M_URDF.exists(), reason=f"no reference description at {RBY1M_URDF}")
+class TestRby1M:
+    """Wheels turn in no joint of our model; all else is compared."""
+
+    def test_joint_frames_at_random_postures(self, rby1m: mujoco.MjModel, urdf_m: Urdf) -> None:
+        check_frames(rby1m, urdf_m)
+
+    def test_limits(self, rby1m: mujoco.MjModel, urdf_m: Urdf) -> None:
+        efforts = {
+            rby1m.joint(int(rby1m.actuator_trnid[i, 0])).name: rby1m.actuator_forcerange[i, 1]
+            for i in range(rby1m.nu)
+            if rby1m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        }
+        moving = [
+            joint for joint in urdf_m.joints if joint.get("type") not in ("fixed", "continuous")
+        ]
+        assert len(moving) == rby1m.njnt - 1
+        for joint in moving:
+            name, limit = get_text(joint, "name"), get_child(joint, "limit")
+            theirs = [float(get_text(limit, key)) for key in ("lower", "upper")]
+            assert np.allclose(rby1m.joint(name).range, theirs, atol=1e-6), name
+            if name in efforts:
+                assert efforts[name] == float(get_text(limit, "effort")), name
+        torso = {f"torso_{i}" for i in range(6)}
+        arms = {f"{side}_arm_{i}" for side in ("left", "right") for i in range(7)}
+        assert torso | arms <= set(efforts)
+
+    def test_masses_and_inertias(self, rby1m: mujoco.MjModel, urdf_m: Urdf) -> None:
+        check_links(read_links(rby1m), {name: urdf_m.numbers(name) for name in urdf_m.links})
+        total = sum(urdf_m.numbers(name).mass for name in urdf_m.links)
+        assert mujoco.mj_getTotalmass(rby1m) == pytest.approx(total, rel=1e-6)
+        assert total == pytest.approx(163.8, abs=0.05)
+
+    def test_drive_matches_the_description(self, rby1m: mujoco.MjModel) -> None:
+        mobile = get_child(ElementTree.parse(RBY1M_URDF).getroot(), "mobile")
+        assert get_text(mobile, "type") == "mecanum"
+        length, width, radius = (float(x) for x in get_text(mobile, "params").split())
+        data = mujoco.MjData(rby1m)
+        mujoco.mj_kinematics(rby1m, data)
+        wheels = get_text(mobile, "joints").split()
+        drive = make_morphology("rby1m").drive
+        assert drive is not None
+        assert set(drive.wheels) == set(wheels)
+        for name in wheels:
+            place = data.site(name).xpos  # where it touches the ground
+            assert abs(place[0] + 0.002) == pytest.approx(length)
+            assert abs(place[1]) == pytest.approx(width)
+            assert place[2] == pytest.approx(0, abs=1e-9)
+            assert abs(drive.wheels[name][2]) == pytest.approx(length + width)
+        assert drive.radius == radius == rby1m.geom("front_left_wheel").size[0]

@@ -13,6 +13,7 @@ from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import DoublePinchConfig, DoublePinchDetector, grip_from_pinch
 from xop_lerobot.operator.recording import load_recording
+from xop_lerobot.operator.script import list_scripts
 
 SHARED = Path(os.environ.get("XOP_SHARED", Path(__file__).parents[3] / "shared"))
 RATES = [25, 30, 50, 60, 90, 120]
@@ -132,7 +133,7 @@ def test_a_clock_that_goes_back_starts_anew() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [25, 50])
-@pytest.mark.parametrize("script", ["g1_squat_walk_reach", "rby1_drive_reach"])
+@pytest.mark.parametrize("script", list_scripts())
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_scripts_toggle_twice(script: str, seed: int, rate: int) -> None:
     device = make_device(DeviceConfig(path=script, seed=seed))

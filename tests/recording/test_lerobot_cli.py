@@ -232,8 +232,8 @@ def test_xop_record_takes_our_types_only(tmp_path, monkeypatch):
     with pytest.raises(SystemExit) as stop:
         run(monkeypatch, "xop-record", *flags, *record_flags(tmp_path / "data"))
     assert str(stop.value) == (
-        "error: xop-record takes --robot.type=xop_g1 or xop_rby1 and --teleop.type=xop, got "
-        "koch_follower and xop. Use lerobot-record for others"
+        "error: xop-record takes --robot.type=xop_g1, xop_rby1 or xop_rby1m and "
+        "--teleop.type=xop, got koch_follower and xop. Use lerobot-record for others"
     )
 
 

@@ -399,7 +399,7 @@ def test_no_robot_in_the_session(session):
     with pytest.raises(LinkError) as error:
         teleop.get_action()
     assert str(error.value) == (
-        f"no xop robot in session '{session}'. Use --robot.type=xop_g1 or xop_rby1 with "
+        f"no xop robot in session '{session}'. Use --robot.type=xop_g1, xop_rby1 or xop_rby1m with "
         f"--robot.session={session}, the same as --teleop.session."
     )
 

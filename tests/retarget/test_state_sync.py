@@ -21,7 +21,7 @@ from xop_lerobot.plant.simulation import Simulation, SimulationConfig
 from xop_lerobot.retarget.sync.config import SyncConfig, SyncStatus
 from xop_lerobot.retarget.sync.state_sync import StateSync
 
-ROBOTS = ("g1", "rby1", "toy")
+ROBOTS = ("g1", "rby1", "rby1m", "toy")
 DT = 0.04
 
 

@@ -11,6 +11,7 @@ import toy_robot
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.morphology.contacts import Feet, Wheels
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.rby1m import MecanumWheels
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.sync.config import SyncConfig
 from xop_lerobot.retarget.sync.contacts import compute_equilibrium, make_contacts
@@ -31,6 +32,7 @@ class GlidingToy(toy_robot.Toy):
 MORPHOLOGIES = {
     "g1": lambda: make_morphology("g1"),
     "rby1": lambda: make_morphology("rby1"),
+    "rby1m": lambda: make_morphology("rby1m"),
     "toy": toy_robot.Toy,
     "rolling toy": toy_robot.RollingToy,
     "gliding toy": GlidingToy,
@@ -209,7 +211,9 @@ def test_contact_velocity_equals_finite_differences(robot):
             ends.append(data.xpos[contact.body] + data.xmat[contact.body].reshape(3, 3) @ local)
         speed = (ends[0] - ends[1]) / 2e-6
         got = jacobian @ qvel
-        if isinstance(morphology.contact_kind, Wheels) and not contact.rolls:
+        if isinstance(morphology.contact_kind, MecanumWheels):
+            np.testing.assert_allclose(got, [speed[2]], atol=1e-6)
+        elif isinstance(morphology.contact_kind, Wheels) and not contact.rolls:
             np.testing.assert_allclose(got, [axle @ speed, speed[2]], atol=1e-6)
         else:
             np.testing.assert_allclose(got[:3], speed, atol=1e-6)

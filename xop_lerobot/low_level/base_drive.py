@@ -94,6 +94,12 @@ class DiffDrive(BaseDrive):
     name = "diff_drive"
 
 
+class MecanumDrive(BaseDrive):
+    """Four mecanum wheels: RB-Y1 M."""
+
+    name = "mecanum_drive"
+
+
 def _pairs(
     actuators: list[str], wanted: list[str] | tuple[str, ...], source: tuple[str, ...] | None = None
 ) -> tuple[list[int], list[int]]:

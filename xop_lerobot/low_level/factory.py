@@ -15,7 +15,11 @@ if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
 
 POLICIES: Registry[Callable[..., LowLevelPolicy]] = Registry(
-    "low-level policy", {"diff_drive": "xop_lerobot.low_level.base_drive:DiffDrive"}
+    "low-level policy",
+    {
+        "diff_drive": "xop_lerobot.low_level.base_drive:DiffDrive",
+        "mecanum_drive": "xop_lerobot.low_level.base_drive:MecanumDrive",
+    },
 )
 """Factories by name, called as ``factory(path=None)``: the tables that ship with the package, and
 the policies that are code."""

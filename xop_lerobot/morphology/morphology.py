@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal
@@ -257,6 +257,7 @@ MORPHOLOGIES: Registry[type[Morphology]] = Registry(
     {
         "g1": "xop_lerobot.morphology.g1:G1",
         "rby1": "xop_lerobot.morphology.rby1:RBY1",
+        "rby1m": "xop_lerobot.morphology.rby1m:RBY1M",
     },
 )
 
@@ -268,13 +269,16 @@ def list_robots() -> tuple[str, ...]:
 
 def say_robots() -> str:
     """Names of this project's robots, as a help text lists them: ``"g1, rby1 or rby1m"``."""
-    *others, last = MORPHOLOGIES.built_in
-    return f"{', '.join(others)} or {last}"
+    return _say_choices(MORPHOLOGIES.built_in)
 
 
 def list_robot_types() -> str:
     """LeRobot types of this project's robots, as an error names them: ``"xop_g1 or xop_rby1"``."""
-    return " or ".join(f"xop_{name}" for name in MORPHOLOGIES.built_in)
+    return _say_choices([f"xop_{name}" for name in MORPHOLOGIES.built_in])
+
+
+def _say_choices(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} or {names[-1]}"
 
 
 def make_morphology(name: str) -> Morphology:
