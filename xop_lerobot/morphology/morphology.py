@@ -1,4 +1,4 @@
-"""The interface that a third robot implements, and the registry of robots."""
+"""The interface that every robot implements, and the registry of robots."""
 
 from __future__ import annotations
 
