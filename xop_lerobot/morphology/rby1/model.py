@@ -83,6 +83,7 @@ def build_on_base(
     looks: Sequence[Shape],
     sites: Sequence[Frame],
     add_base: Callable[[mujoco.MjSpec], None],
+    wrist_cameras: Sequence[Frame] = shapes.WRIST_CAMERAS,
 ) -> mujoco.MjSpec:
     """Build a robot with the upper body of RB-Y1 on some base.
 
@@ -96,6 +97,7 @@ def build_on_base(
         looks: What collides and is seen.
         sites: Its named frames.
         add_base: Adds what stands on the floor.
+        wrist_cameras: The cameras of the hands.
     """
     import mujoco  # noqa: PLC0415
 
@@ -116,7 +118,7 @@ def build_on_base(
         for first, second in shapes.EXCLUDED:
             spec.add_exclude(bodyname1=first, bodyname2=second)
         rows.add_camera(spec, shapes.HEAD_CAMERA, shapes.HEAD_FOVY)
-        for camera in shapes.WRIST_CAMERAS:
+        for camera in wrist_cameras:
             rows.add_camera(spec, camera, shapes.WRIST_FOVY)
         rows.add_camera(spec, shapes.SCENE_CAMERA, shapes.SCENE_FOVY, tracking=True)
         rows.add_imu(spec)

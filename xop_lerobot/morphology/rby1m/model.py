@@ -46,7 +46,16 @@ WHEEL_SPEED = 31.4
 
 def build_rby1m(kind: str) -> mujoco.MjSpec:
     """Build RB-Y1 M alone; see `build_on_base`."""
-    return build_on_base("rby1m", kind, LINKS, GRIPPERS, shapes.SHAPES, shapes.SITES, add_wheels)
+    return build_on_base(
+        "rby1m",
+        kind,
+        LINKS,
+        GRIPPERS,
+        shapes.SHAPES,
+        shapes.SITES,
+        add_wheels,
+        shapes.WRIST_CAMERAS,
+    )
 
 
 def add_wheels(spec: mujoco.MjSpec) -> None:

@@ -41,6 +41,12 @@ FINGERS = tuple(
     for name in ("ee_finger_r1", "ee_finger_r2", "ee_finger_l1", "ee_finger_l2")
 )
 
+WRIST_CAMERAS = tuple(
+    Frame(f"{side}_wrist", f"ee_{side}", (0.15, 0, 0.06), (-0.62, 0, -0.78), (1, 0, 0))
+    for side in ("left", "right")
+)
+"""Above the hand, whose fingers open to the sides, looking at them."""
+
 _OWN = (*BASE, *LEFT, *(mirror(shape) for shape in LEFT), *FINGERS)
 _REPLACED = {"wheel_l", "wheel_r", *(shape.link for shape in _OWN)}
 
