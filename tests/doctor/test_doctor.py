@@ -43,6 +43,7 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.certificate import get_certificate
 
 LEROBOT = importlib.metadata.version("lerobot")
+ROBOTS = "xop_g1, xop_rby1, xop_rby1m"
 
 
 def test_interpreter(monkeypatch):
@@ -97,7 +98,7 @@ def test_plugin(monkeypatch):
     fine = answer(True, known)
     assert (fine.level, fine.text) == (
         Level.OK,
-        f"LeRobot {LEROBOT} knows xop_g1, xop_rby1, xop_rby1m and the teleoperator xop; all 15 patches fit it",
+        f"LeRobot {LEROBOT} knows {ROBOTS} and the teleoperator xop; all 15 patches fit it",
     )
     missing = answer(True, known | {"robots": ["xop_g1", "xop_rby1m"], "teleoperators": []})
     assert (missing.level, missing.text) == (Level.FAIL, "LeRobot does not know xop_rby1, xop")
@@ -111,14 +112,14 @@ def test_plugin(monkeypatch):
 )
 def test_a_lerobot_that_does_not_fit(monkeypatch, refused, warned, level):
     known = {
-        "robots": ["xop_g1", "xop_rby1"], "teleoperators": ["xop"], "patches": 15,
+        "robots": ["xop_g1", "xop_rby1", "xop_rby1m"], "teleoperators": ["xop"], "patches": 15,
         "refused": refused, "warned": warned,
     }  # fmt: skip
     monkeypatch.setattr(checks, "run_child", lambda *_, **__: Answer(True, json.dumps(known)))
     found = check_plugin(Setup())
     assert (found.level, found.figures["misfits"]) == (level, [*refused, *warned])
     assert found.text == (
-        f"LeRobot {LEROBOT} knows xop_g1, xop_rby1 and the teleoperator xop; of 15 patches of it "
+        f"LeRobot {LEROBOT} knows {ROBOTS} and the teleoperator xop; of 15 patches of it "
         f"{len(refused + warned)} do not fit. {' '.join(refused + warned)}"
     )
     assert found.advice == (
