@@ -13,7 +13,7 @@ from lerobot_teleoperator_xop import Xop, XopConfig
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import quat_exp, quat_from_rpy, quat_rotate
 from xop_lerobot.low_level.factory import make_policy
-from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.morphology.morphology import MORPHOLOGIES, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget import factory
 from xop_lerobot.retarget.config import RetargeterConfig
@@ -305,9 +305,15 @@ def test_a_file_that_is_not_there_or_no_yaml(tmp_path):
 
 
 BLIND = {
-    ("g1", "mpc"): "robot 'g1' keeps clear of nothing. Robots that do: rby1",
+    ("g1", "mpc"): "robot 'g1' keeps clear of nothing. Robots that do: rby1, rby1m",
     ("rby1", "direct"): "retargeter 'direct' keeps clear of nothing. Retargeters that do: mpc",
 }
+
+
+@pytest.fixture(autouse=True)
+def without_toys(monkeypatch):
+    """Robots that other tests have registered are in no text."""
+    monkeypatch.setattr(factory, "MORPHOLOGIES", MORPHOLOGIES.built_in)
 
 
 @pytest.mark.parametrize("robot, kind", BLIND)
@@ -328,7 +334,9 @@ def test_a_file_that_would_be_ignored_is_refused(tmp_path, robot, kind):
 def test_it_is_refused_before_anything_is_recorded(tmp_path):
     robot = XopG1(XopG1Config(session="obstacles", cameras=[]))
     retargeter = RetargeterConfig(obstacles=write(tmp_path, FILE))
-    with pytest.raises(BadValue, match="robot 'g1' keeps clear of nothing. Robots that do: rby1"):
+    with pytest.raises(
+        BadValue, match="robot 'g1' keeps clear of nothing. Robots that do: rby1, rby1m"
+    ):
         Xop(XopConfig(session="obstacles", retargeter=retargeter))
     robot.disconnect()
 
