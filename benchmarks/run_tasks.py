@@ -1,7 +1,7 @@
 """Run tasks of a simulated person with parts of the retargeter left out.
 
     python -m benchmarks.run_tasks --robot rby1 --task box_pick_and_place --trials 20 \
-        --ablations default,no_twist_room,no_hold,no_yield --json outputs/tasks.json
+        --ablations default,no_bias,no_hold,no_yield --json outputs/tasks.json
 
 The trials are those of `xop-eval --methods mpc`, the ablations those of `benchmarks.run_tracking`.
 Trials that the JSON file holds already are not run again.

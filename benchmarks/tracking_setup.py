@@ -138,10 +138,6 @@ ABLATIONS: dict[str, Ablation] = {
         "no path and no heading for wheels",
         replaced={"xop_lerobot.retarget.guidance.guidance:Guidance._drives": _always(False)},
     ),
-    "no_twist_room": Ablation(
-        "the waist turns as far as its joint does",
-        replaced={"xop_lerobot.retarget.guidance.guidance:TwistRoom.compute": _always(math.inf)},
-    ),
     "no_hold": Ablation(
         "what hands hold does not go with the body",
         replaced={"xop_lerobot.retarget.arms.contact:ArmHold.update": _always(None)},

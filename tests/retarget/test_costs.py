@@ -471,15 +471,6 @@ def test_where_a_base_on_wheels_shall_face(heading, velocity, look, facing):
     assert math.atan2(y, x) == pytest.approx(facing + 0.5, abs=0.01)
 
 
-def test_arms_in_the_way_of_the_waist_bar_a_facing():
-    """Backing up would twist the waist by 1.63 rad; with less room the base turns round."""
-    velocity = np.array([-2.3, 9.7])
-    backing = compute_facing(-0.5, velocity, 0.3, speed=1.0)
-    turning = compute_facing(-0.5, velocity, 0.3, speed=1.0, room=1.2)
-    assert math.atan2(*backing[::-1]) == pytest.approx(-1.33, abs=0.02)
-    assert math.atan2(*turning[::-1]) == pytest.approx(1.8, abs=0.02)
-
-
 def test_the_last_centimetres_are_left_to_the_waist():
     lengths = [
         np.hypot(*compute_facing(0.0, np.array([0.3, 0.3]), 0.0, speed))

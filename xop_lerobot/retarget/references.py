@@ -100,7 +100,7 @@ class References:
         resting = {name: float(pose[0]) for name, pose in standing.items()}
         self._footprint = Footprint(morphology, model, obstacles)
         self.postures = PostureGuide(morphology, model, command_model, support, load)
-        self.guidance = Guidance(morphology, command_model, resting, self._footprint)
+        self.guidance = Guidance(morphology, model, command_model, resting, self._footprint)
         self.sites: dict[str, str] = {}
         self.upright: tuple[str, ...] = ()
 
@@ -117,7 +117,6 @@ class References:
 
     def reset(self) -> None:
         """Start anew."""
-        self.guidance.reset()
         self.postures.reset()
 
     def compute_poses(self, qpos: np.ndarray) -> dict[str, np.ndarray]:

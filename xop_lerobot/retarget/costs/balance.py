@@ -268,9 +268,7 @@ _MAX_TWIST = 1.9  # twist of the waist beyond which the base does not face so [r
 _TOO_TWISTED = 10.0  # how much a twist beyond it counts
 
 
-def compute_facing(
-    heading: float, velocity: np.ndarray, look: float, speed: float, room: float = math.inf
-) -> np.ndarray:
+def compute_facing(heading: float, velocity: np.ndarray, look: float, speed: float) -> np.ndarray:
     r"""Compute where a base on wheels shall face, and how much that counts.
 
     .. math:: \psi^\pm = \angle(\pm u + u_0\,(\cos\psi_g, \sin\psi_g))
@@ -288,19 +286,18 @@ def compute_facing(
         velocity: The axle's velocity u [m/s]. Shape (2,).
         look: Heading of the goal [rad].
         speed: Speed at which what is tracked would be at its goal in time [m/s].
-        room: How far the arms let the waist twist [rad].
 
     Returns:
         Direction in the world, as long as it counts: 0 to 1. Shape (2,).
     """
     ahead = _LOOKING * np.array([math.cos(look), math.sin(look)])
-    best, least, most = look, math.inf, min(_MAX_TWIST, room)
+    best, least = look, math.inf
     for sign, effort in ((1.0, 0.0), (-1.0, _BACKWARDS)):
         x, y = sign * velocity + ahead
         facing = math.atan2(y, x)
         effort += abs(float(wrap_angle(facing - heading)))  # noqa: PLW2901
         twist = abs(float(wrap_angle(facing - look)))
-        effort += _TWIST * twist + _TOO_TWISTED * max(twist - most, 0.0)  # noqa: PLW2901
+        effort += _TWIST * twist + _TOO_TWISTED * max(twist - _MAX_TWIST, 0.0)  # noqa: PLW2901
         if effort < least:
             best, least = facing, effort
     share = min(max((speed - _REST) / (_FULL - _REST), 0.0), 1.0)

@@ -73,7 +73,6 @@ _FINE = 6.0  # gain of the last centimetres and degrees, where the braking law i
 _FINE_DRIVE, _FINE_TURN = 0.05, 0.1  # within which that gain holds [m], [rad]
 _BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
 _TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
-_ROOM_SPARE = 0.1  # by which a waist that waits for its base may be beyond what arms let it [rad]
 _RESTING, _TURNING = 0.15, 0.45  # yaw rates of a goal that rests and of one that turns [rad/s]
 _TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
 _CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
@@ -204,7 +203,6 @@ class RoutePlanner:
         goal: np.ndarray,
         duration: float,
         turn_rate: float = 0.0,
-        room: float = math.inf,
         ahead: float | None = None,
     ) -> Route:
         """Simulate the way.
@@ -218,7 +216,6 @@ class RoutePlanner:
             duration: Length of the way to look at [s].
             turn_rate: Yaw rate of the goal; behind one that turns the base does not wait until
                 the waist is at its limit [rad/s].
-            room: How far the arms let the waist twist [rad].
             ahead: How far ahead of the base it will be, where not as at rest [m].
         """
         drive, heading = self._driving, float(quat_yaw(qpos[3:7]))
@@ -233,7 +230,7 @@ class RoutePlanner:
             waist = (self._waist - self._pivot, 0.0)
             turning = min(max((abs(turn_rate) - _RESTING) / (_TURNING - _RESTING), 0.0), 1.0)
             most = drive.arrival_twist
-            twist = min(most + turning * (drive.turning_twist - most), room)
+            twist = most + turning * (drive.turning_twist - most)
             look = float(compute_heading(goal[3:]))
             aim = _Aim(gx, gy, look, twist, waist, resting - self._waist, drive)
         count = math.ceil(duration / _DT) + 1
@@ -242,9 +239,8 @@ class RoutePlanner:
             way = self._find_free(way, aim, speeds)
         turns = np.zeros(count)
         if name not in self._hands:
-            limit = min(drive.waist, room + _ROOM_SPARE)
             twist = float(compute_heading(pose[3:])) - heading
-            turns = _unwind(twist, aim.look, way[:, 2], limit, drive.waist_speed)
+            turns = _unwind(twist, aim.look, way[:, 2], drive.waist, drive.waist_speed)
         offsets = way[:, :2] - (gx, gy) + _turn(aim.waist, way[:, 2])
         offsets += _turn((aim.ahead, 0.0), aim.look + turns)
         far = np.hypot(offsets[:, 0], offsets[:, 1])
