@@ -183,6 +183,7 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
     from xop_lerobot.plant.config import SimulationConfig
     from xop_lerobot.plant.simulation import Simulation
     from xop_lerobot.retarget.config import RetargeterConfig
+    from xop_lerobot.session import Tick
     from xop_lerobot.teleoperation import TeleoperationConfig
 
     fps = settings.fps
@@ -206,12 +207,12 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
         due = time.monotonic()
         while page.is_alive():
             begun = time.thread_time()
-            action, record = teleoperation.step(loop.state)
+            action, tick = teleoperation.step(Tick(loop.state))
             now = time.monotonic()
-            if record.engaged:
+            if tick.engaged:
                 delays.tick_work.append(time.thread_time() - begun)
-            if record.engaged and record.frame is not None and record.frame.time in delays.sent:
-                delays.command.append(now - delays.sent[record.frame.time])
+            if tick.engaged and tick.frame is not None and tick.frame.time in delays.sent:
+                delays.command.append(now - delays.sent[tick.frame.time])
                 delays.told.append(device.status.delay or 0.0)
             loop.execute(action, 1 / fps)
             due = max(due + 1 / fps, time.monotonic() - 1)

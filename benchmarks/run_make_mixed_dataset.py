@@ -33,7 +33,8 @@ from tqdm import tqdm
 
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import BadValue, XopError
-from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+from xop_lerobot.session import TaskStatus
+from xop_lerobot.tasks.task import TASKS, Task
 
 if TYPE_CHECKING:
     import mujoco

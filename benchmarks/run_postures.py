@@ -34,6 +34,7 @@ from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.model.posture import Repertoire
 from xop_lerobot.retarget.mpc import MpcRetargeter
+from xop_lerobot.session import Tick
 from xop_lerobot.teleoperation import TeleoperationConfig
 
 NEAR_M, NEAR_DEG = 0.05, 5.0
@@ -122,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
         for i, goal in enumerate(draw_goals(retargeter, args.goals, args.seed)):
             device.head = goal
             for _ in range(round(args.hold / teleoperation.dt)):
-                action, _ = teleoperation.step(loop.state)
+                action, _ = teleoperation.step(Tick(loop.state))
                 loop.execute(action, teleoperation.dt)
             reached = measure()["head"]
             away = float(np.linalg.norm(reached[:3] - goal[:3]))

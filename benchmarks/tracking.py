@@ -49,6 +49,7 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
+from xop_lerobot.session import Tick
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 TRACE_DT = 0.2
@@ -218,9 +219,9 @@ def _drive(loop: PolicyLoop, teleoperation: Teleoperation, track: GoalTrack) -> 
     clocks = []
     while (clock := device.clock(loop.state.time)) < track.duration - dt / 2:
         state = loop.state
-        action, record = teleoperation.step(state)
-        if record.goal is not None or clock > 0:
-            rows.add(state, action.command, record)
+        action, tick = teleoperation.step(Tick(state))
+        if tick.goal is not None or clock > 0:
+            rows.add(tick, action.command)
             clocks.append(clock)
         if state.fallen:
             break

@@ -28,7 +28,7 @@ from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.plan import Plan, Retargeter, StampedPlan
 from xop_lerobot.retarget.plan_follower import BackgroundPlanner
-from xop_lerobot.session import RobotInfo, TickRecord
+from xop_lerobot.session import RobotInfo, Tick
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
@@ -113,8 +113,8 @@ class Rig:
         poses = self.kinematics.compute_poses(qpos)
         return {name: poses[site] for name, site in self.morphology.frames.items()}
 
-    def tick(self) -> tuple[RobotAction, TickRecord]:
-        action, record = self.teleop.step(self.loop.state)
+    def tick(self) -> tuple[RobotAction, Tick]:
+        action, record = self.teleop.step(Tick(self.loop.state))
         executed = self.loop.execute(action, self.dt)
         # What is recorded as the action is what the robot does, to the last bit.
         np.testing.assert_array_equal(executed.command, action.command)
@@ -122,7 +122,7 @@ class Rig:
         assert executed.mode is action.mode
         return action, record
 
-    def run(self, seconds: float) -> list[tuple[RobotAction, TickRecord]]:
+    def run(self, seconds: float) -> list[tuple[RobotAction, Tick]]:
         return [self.tick() for _ in range(round(seconds / self.dt))]
 
     def close(self) -> None:
@@ -150,7 +150,7 @@ def rig() -> Iterator[Callable[..., Rig]]:
         each.close()
 
 
-def assert_no_step(rig: Rig, ticks: list[tuple[RobotAction, TickRecord]]) -> None:
+def assert_no_step(rig: Rig, ticks: list[tuple[RobotAction, Tick]]) -> None:
     """No command, and no arm, moves faster than the robot may."""
     space = rig.teleop.morphology.command_space
     for (before, _), (after, _) in zip(ticks[:-1], ticks[1:], strict=True):
@@ -201,11 +201,11 @@ def test_engaging_makes_no_step(rig, name):
 def test_it_does_not_engage_while_the_robot_moves_or_lies(rig, name):
     r = rig(name)
     for fault in ({"settled": False}, {"fallen": True}):
-        _, record = r.teleop.step(dataclasses.replace(r.loop.state, **fault))
+        _, record = r.teleop.step(Tick(dataclasses.replace(r.loop.state, **fault)))
         assert not record.engaged
         r.loop.execute(r.morphology.rest_action(), r.dt)
     assert r.person.starts == []
-    _, record = r.teleop.step(r.loop.state)
+    _, record = r.teleop.step(Tick(r.loop.state))
     assert record.engaged
     assert r.person.starts == [r.loop.state.time]
 
@@ -292,7 +292,7 @@ def test_a_fall_ends_the_engagement_until_the_robot_stands_again(rig):
     assert r.teleop.alignment.is_engaged
     for _ in range(5):
         state = dataclasses.replace(r.loop.state, fallen=True)
-        action, record = r.teleop.step(state)
+        action, record = r.teleop.step(Tick(state))
         assert not record.engaged
         assert action.mode is Mode.STATIONARY
         np.testing.assert_array_equal(action.arms, state.arms)
@@ -477,7 +477,7 @@ def test_the_record_of_a_tick_is_complete(rig):
     r = rig("rby1")
     r.run(0.1)
     state = r.loop.state
-    action, record = r.teleop.step(state)
+    action, record = r.teleop.step(Tick(state))
     assert record.state is state
     assert record.frame.time == state.time
     assert set(record.goal.poses) == set(FRAMES)
@@ -675,7 +675,7 @@ def test_in_real_time_the_robot_holds_until_the_first_plan_and_then_follows():
     loop.reset(seed=0, settle_s=0.4)
     rest = morphology.rest_action()
     for _ in range(5):
-        action, record = teleop.step(loop.state)
+        action, record = teleop.step(Tick(loop.state))
         assert record.engaged
         assert "plan_age" not in record.health
         np.testing.assert_allclose(action.command, rest.command, atol=1e-6)
@@ -684,9 +684,9 @@ def test_in_real_time_the_robot_holds_until_the_first_plan_and_then_follows():
         slow.go.release()
     wait_for_plan(planner)
     for _ in range(24):
-        action, _ = teleop.step(loop.state)
+        action, _ = teleop.step(Tick(loop.state))
         loop.execute(action, 0.04)
-    action, record = teleop.step(loop.state)
+    action, record = teleop.step(Tick(loop.state))
     assert record.health["plan_age"] >= 0
     assert np.abs(action.command - rest.command).max() > 0.01
     teleop.disconnect()
@@ -700,8 +700,8 @@ def test_two_ticks_in_one_period_of_the_policy(rig):
     r = rig("rby1")
     r.run(0.1)
     state = r.loop.state
-    r.teleop.step(state)
-    second, _ = r.teleop.step(state)
+    r.teleop.step(Tick(state))
+    second, _ = r.teleop.step(Tick(state))
     np.testing.assert_array_equal(second.arms, state.arms)
     assert np.isfinite(second.command).all()
     assert np.isfinite(second.arms).all()

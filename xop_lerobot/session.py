@@ -1,9 +1,9 @@
 """Where the robot and the teleoperator of one process meet, keyed by session.
 
 LeRobot's loops hand the teleoperator no observation, and connect the two in either order.
-So the robot publishes here what it is (`announce`) and, in every `get_observation`, its state;
-the teleoperator looks both up when it needs them, and publishes what it did in the tick
-for the recorder. Publishing replaces one immutable value, so readers need no lock.
+So the robot publishes here what it is (`announce`) and, in every `get_observation`, begins a
+`Tick` (`begin_tick`). Teleoperator and robot add to that tick what they do in it (`put`), and the
+recorder reads it. Publishing replaces one immutable value, so readers need no lock.
 """
 
 from __future__ import annotations
@@ -58,15 +58,48 @@ class RobotInfo:
 
 
 @dataclass(frozen=True)
-class TickRecord:
-    """All that one tick of the teleoperator saw and decided; the recorder's only source.
+class TaskStatus:
+    """Status of an episode's task, decided by the physics alone.
 
     Attributes:
-        state: The robot state that the tick started from.
+        success: Whether the task is accomplished.
+        done: Whether the episode is over, with success or without.
+        failure: Why the episode is lost, in words; empty while it is not.
+        picked_up: Whether the object was held up for long enough.
+        figures: Further figures of the episode by name, fit for JSON.
+        collisions: What of the robot touched which wall or piece of furniture so far, other than
+            the hands where the task is for them to.
+    """
+
+    success: bool
+    done: bool
+    failure: str = ""
+    picked_up: bool = False
+    figures: Mapping[str, float] = field(default_factory=dict)
+    collisions: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Tick:
+    """One control step, from the measurement to its outcome; grows by a stage at a time.
+
+    1. *Observed* by the robot in `get_observation`: `state`, `view`, `pictures`,
+       `proprioception`, and `outcome` as it is before the action.
+    2. *Decided* by the teleoperator in `get_action`: `frame` to `changes`. These stay at their
+       defaults where something else drives the robot, such as a policy.
+    3. *Executed* by the robot in `send_action`: `executed`, and `outcome` after the action.
+    4. Read by the recorder in `add_frame`.
+
+    A stage that comes again in the same tick replaces what it wrote before.
+
+    Attributes:
+        state: The robot state that the tick starts from, as measured.
+        view: What a person could see of the robot and its task, None where no task runs.
+        pictures: What the robot's cameras see, by name. Shapes (height, width, 3), uint8.
+        proprioception: The robot's observation without pictures, by key.
         frame: The operator's frame, None before the first.
         goal: The goal, None while not engaged.
-        engaged: Whether the operator drives.
-        command: The retargeter's command a*, before limits. Shape (k,).
+        command: The retargeter's command a*, before limits; None until it is decided. Shape (k,).
         cost: Cost of the plan by term.
         health: Figures on the plan's health by name (solve time, age, effective samples, …).
         finished: Whether the device has played out.
@@ -74,45 +107,33 @@ class TickRecord:
             accordance with the ground first; None where it was not. Shape (nq,).
         settings: What was in force in the tick (preset, weights, targets, mode, …).
         changes: What came into force at its beginning.
+        executed: What the robot executes, limits applied, by action key; None until it is sent
+            an action.
+        outcome: Status of the task, None where no task runs.
     """
 
     state: RobotState
-    frame: OperatorFrame | None
-    goal: Goal | None
-    engaged: bool
-    command: np.ndarray
-    cost: Mapping[str, float]
-    health: Mapping[str, float]
+    view: View | None = None
+    pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
+    proprioception: Mapping[str, float] = field(default_factory=dict)
+
+    frame: OperatorFrame | None = None
+    goal: Goal | None = None
+    command: np.ndarray | None = None
+    cost: Mapping[str, float] = field(default_factory=dict)
+    health: Mapping[str, float] = field(default_factory=dict)
     finished: bool = False
     estimate: np.ndarray | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     changes: tuple[AppliedChange, ...] = ()
 
+    executed: Mapping[str, float] | None = None
+    outcome: TaskStatus | None = None
 
-@dataclass(frozen=True)
-class Outcome:
-    """How far the task of a scene is; nothing publishes it where no task runs.
-
-    Attributes:
-        success: Whether the task is accomplished.
-        done: Whether the episode is over, with success or without.
-    """
-
-    success: bool
-    done: bool
-
-
-@dataclass(frozen=True)
-class Executed:
-    """What a robot really executes of the action that it was sent last.
-
-    Attributes:
-        observation: The proprioception that it was sent after, by key.
-        action: What is executed, limits applied, by action key.
-    """
-
-    observation: Mapping[str, float]
-    action: Mapping[str, float]
+    @property
+    def engaged(self) -> bool:
+        """Whether the operator drives."""
+        return self.goal is not None
 
 
 class Recorder(Protocol):
@@ -136,15 +157,10 @@ class Session:
 
     Attributes:
         name: The session's name.
-        state: State that the robot published last.
-        tick: Record of the teleoperator's last tick.
-        outcome: Outcome of the task after the last action, None where no task runs.
-        executed: What the robot executes of the last action; None before the first.
-        view: What a person could see of the robot and its task now, None where no task runs.
+        tick: The present tick, None before the robot's first observation and after a reset.
         obstacles: Walls and furniture of the episode, None where no task places any.
         episode: Index of the episode being recorded; the robot's seed depends on it.
         reset_count: Number of robot resets so far; a change tells the teleoperator to re-align.
-        pictures: What the robot's cameras saw last, by name.
         progress: How far the recording is, None where nothing is recorded.
         recorder: Who records, None where nobody does.
         configs: Resolved configuration of each part (`robot`, `teleop`), saved with a dataset.
@@ -155,15 +171,10 @@ class Session:
         self._lock = Lock()
         self._robots: list[RobotInfo] = []
         self._reset_asked = False
-        self.state: RobotState | None = None
-        self.tick: TickRecord | None = None
-        self.outcome: Outcome | None = None
-        self.executed: Executed | None = None
-        self.view: View | None = None
+        self.tick: Tick | None = None
         self.obstacles: tuple[Obstacle, ...] | None = None
         self.episode = 0
         self.reset_count = 0
-        self.pictures: Mapping[str, np.ndarray] = {}
         self.progress: Progress | None = None
         self.recorder: Recorder | None = None
         self.configs: dict[str, Any] = {}
@@ -200,6 +211,21 @@ class Session:
         if self.recorder is not None:
             self.recorder.forget_presses()
 
+    def begin_tick(self, tick: Tick) -> None:
+        """Publish an observation as the beginning of a tick; the robot alone calls this."""
+        with self._lock:
+            self.tick = tick
+
+    def put(self, tick: Tick) -> None:
+        """Publish `tick` with one stage more.
+
+        Nothing happens if it is not the present one any more, because the robot was observed or
+        reset meanwhile: its stages must not mix with those of another tick.
+        """
+        with self._lock:
+            if self.tick is not None and self.tick.state is tick.state:
+                self.tick = tick
+
     def ask(self, wish: Wish) -> tuple[Cue, str]:
         """Ask the recorder for `wish`; return what the operator is told."""
         if self.recorder is None:
@@ -207,9 +233,7 @@ class Session:
         return self.recorder.grant(wish)
 
     def _forget(self) -> None:
-        self.state = self.tick = self.outcome = self.executed = None
-        self.view = self.obstacles = None
-        self.pictures = {}
+        self.tick = self.obstacles = None
 
     @property
     def robot(self) -> RobotInfo:

@@ -20,7 +20,7 @@ from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DeviceConfig, make_device
-from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, View, Wish
+from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, Wish
 from xop_lerobot.operator.engagement import Clutch, Engagement
 from xop_lerobot.operator.feedback import list_warnings, tell_changes
 from xop_lerobot.operator.frame import OperatorFrame
@@ -40,7 +40,7 @@ from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.presets import build_configs
 from xop_lerobot.retarget.smoothing import CommandSmoother
 from xop_lerobot.retarget.sync.state_sync import StateSync, Synced
-from xop_lerobot.session import RobotInfo, TickRecord
+from xop_lerobot.session import RobotInfo, Tick
 
 RETREAT_RATE = 1.0
 """Speed at which arms in trouble go back to rest [rad/s]."""
@@ -177,11 +177,6 @@ class Teleoperation:
         path = self.config.retargeter.obstacles
         self._follower.set_obstacles(obstacles + (load_obstacles(path) if path else ()))
 
-    def see(self, view: View | None) -> None:
-        """Show the operator the robot and its task, before `step`; None where no task runs."""
-        if view is not None:
-            self.device.see(dataclasses.replace(view, engaged=self.alignment.is_engaged))
-
     def change(self, change: Change | Mapping[str, Any], source: str = "call") -> dict[str, Any]:
         """Ask for other settings, from any thread; they hold from the next `step` on.
 
@@ -222,19 +217,16 @@ class Teleoperation:
         """What is in force, and the mode, as JSON knows them."""
         return {**self._settings.current.to_dict(), "mode": self._mode.name.lower()}
 
-    def show(self, progress: Progress | None, pictures: Mapping[str, np.ndarray]) -> None:
+    def show(self, progress: Progress | None) -> None:
         """Show the operator what `step` has made of the tick.
 
         Args:
             progress: How far the recording is, None where nothing is recorded.
-            pictures: What the robot's cameras see, by name. Shapes (height, width, 3), uint8.
         """
         if self._shown is None:
             return
         shown, notices = self._shown, self._board.notices
-        self.device.show(
-            dataclasses.replace(shown, notices=notices, progress=progress, pictures=pictures)
-        )
+        self.device.show(dataclasses.replace(shown, notices=notices, progress=progress))
 
     def take_wishes(self) -> tuple[Wish, ...]:
         """What the operator asks of the recording since the last call, by gestures or buttons."""
@@ -264,23 +256,26 @@ class Teleoperation:
     def device(self, device: Device) -> None:
         self._engagement.device = device
 
-    def step(self, state: RobotState) -> tuple[RobotAction, TickRecord]:
+    def step(self, tick: Tick) -> tuple[RobotAction, Tick]:
         """Decide what the robot does next.
 
         Args:
-            state: The robot now, as measured.
+            tick: The robot now, as observed; its view, if there is one, is shown to the operator.
 
         Returns:
-            The action, limited as the robot will limit it, and the record of the tick.
+            The action, limited as the robot will limit it, and the tick with what was decided.
 
         Raises:
             EngageRefused: If a device that engages by itself cannot, the first time: the floor
                 of its recording is wrong, and no robot has moved yet. Later on the robot holds.
         """
-        dt = self.dt if self._last_time is None else max(state.time - self._last_time, 0.0)
-        self._last_time = state.time
+        time = tick.state.time
+        dt = self.dt if self._last_time is None else max(time - self._last_time, 0.0)
+        self._last_time = time
+        if tick.view is not None:
+            self.device.see(dataclasses.replace(tick.view, engaged=self.alignment.is_engaged))
         changes = self._apply_changes()
-        measured, (state, synced) = state, self._synchronise(state)
+        state, synced = self._synchronise(tick.state)
         poses = self._compute_frames(state)
         frame = self.device.read(state.time)
         self._tell_trouble(state)
@@ -300,12 +295,22 @@ class Teleoperation:
         else:
             wanted = self._drive(state, goal, poses["head"], dt)
         action = self._limit(state, wanted)
-        self._shown = self._make_display(state, frame, engaged=goal is not None)
-        return action, self._make_record(measured, synced, frame, goal, wanted, changes)
+        tick = dataclasses.replace(
+            tick,
+            frame=frame,
+            goal=goal,
+            command=wanted.command,
+            finished=self.device.is_finished(time),
+            estimate=None if synced is None else synced.qpos,
+            settings=self.settings,
+            changes=changes,
+            **self._describe_plan(time, synced, engaged=goal is not None),
+        )
+        self._shown = self._make_display(state, tick)
+        return action, tick
 
-    def _make_display(
-        self, state: RobotState, frame: OperatorFrame | None, *, engaged: bool
-    ) -> Display:
+    def _make_display(self, state: RobotState, tick: Tick) -> Display:
+        engaged = tick.engaged
         holding, progress = self._describe_hold(engaged)
         current = self._follower.current if engaged else None
         age = None if current is None else state.time - current.measured
@@ -316,9 +321,10 @@ class Teleoperation:
             clutch=progress,
             holding=holding,
             warnings=list_warnings(
-                self.device, frame, engaged=engaged, plan_age=age, trouble=state.trouble
+                self.device, tick.frame, engaged=engaged, plan_age=age, trouble=state.trouble
             ),
             fallen=state.fallen,
+            pictures=tick.pictures,
         )
 
     def _apply_changes(self) -> tuple[AppliedChange, ...]:
@@ -457,16 +463,11 @@ class Teleoperation:
         self._arms.note(action.arms)
         return action
 
-    def _make_record(
-        self,
-        state: RobotState,
-        synced: Synced | None,
-        frame: OperatorFrame | None,
-        goal: Goal | None,
-        wanted: RobotAction,
-        changes: tuple[AppliedChange, ...],
-    ) -> TickRecord:
-        current = self._follower.current if goal is not None else None
+    def _describe_plan(
+        self, time: float, synced: Synced | None, *, engaged: bool
+    ) -> dict[str, dict[str, float]]:
+        """Cost and health of the plan that is followed."""
+        current = self._follower.current if engaged else None
         cost: dict[str, float] = {}
         health: dict[str, float] = {}
         if synced is not None:
@@ -476,21 +477,9 @@ class Teleoperation:
             cost = dict(plan.cost)
             health |= {
                 "solve_time": plan.timings.get("solve", 0.0),
-                "plan_age": state.time - current.measured,
+                "plan_age": time - current.measured,
                 "effective_samples": plan.effective_samples,
                 "status": float(plan.status),
                 **plan.health,
             }
-        return TickRecord(
-            state=state,
-            frame=frame,
-            goal=goal,
-            engaged=goal is not None,
-            command=wanted.command,
-            cost={**cost, "total": sum(cost.values())},
-            health=health,
-            finished=self.device.is_finished(state.time),
-            estimate=None if synced is None else synced.qpos,
-            settings=self.settings,
-            changes=changes,
-        )
+        return {"cost": {**cost, "total": sum(cost.values())}, "health": health}

@@ -21,7 +21,7 @@ from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.body import Body
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_scene_spec
-from xop_lerobot.session import Executed, RobotInfo, get_session
+from xop_lerobot.session import RobotInfo, Tick, get_session
 from xop_lerobot.tasks.layout import add_task_camera
 from xop_lerobot.tasks.task import make_task
 
@@ -69,7 +69,6 @@ class XopRobot(Robot):
         self._plant: Simulation | None = None
         self._stage: Stage | None = None
         self._loop: PolicyLoop | RealtimeLoop | None = None
-        self._proprioception: dict[str, float] = {}
         self._info = RobotInfo(
             name=self.name,
             morphology=self.morphology,
@@ -159,7 +158,7 @@ class XopRobot(Robot):
         self._session.confirm_reset()
         if stage is not None:
             stage.reset(seed)
-            self._session.outcome, self._session.obstacles = stage.status, stage.obstacles
+            self._session.obstacles = stage.obstacles
 
     @property
     def _connected_loop(self) -> PolicyLoop | RealtimeLoop:
@@ -168,7 +167,7 @@ class XopRobot(Robot):
         return self._loop
 
     def get_observation(self) -> dict[str, Any]:
-        """Measure the robot, publish its state in the session, and take the pictures.
+        """Measure the robot, take the pictures, and begin a tick of the session with both.
 
         Raises:
             NotConnected: Before `connect()`.
@@ -176,15 +175,17 @@ class XopRobot(Robot):
         loop = self._connected_loop
         if self._session.take_reset():
             self._start_episode()
-        state = loop.state
-        self._session.state = state
-        if self._stage is not None:
-            self._session.view = self._stage.view(state)
         assert self._plant is not None
-        pictures = {camera: self._plant.render(camera) for camera in self.cameras}
-        self._session.pictures = pictures
-        self._proprioception = self._body.compute_proprioception(state)
-        return {**self._proprioception, **pictures}
+        state, stage = loop.state, self._stage
+        tick = Tick(
+            state,
+            view=None if stage is None else stage.view(state),
+            pictures={camera: self._plant.render(camera) for camera in self.cameras},
+            proprioception=self._body.compute_proprioception(state),
+            outcome=None if stage is None else stage.status,
+        )
+        self._session.begin_tick(tick)
+        return {**tick.proprioception, **tick.pictures}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         """Execute `action` for one control period.
@@ -209,10 +210,11 @@ class XopRobot(Robot):
         known = {key: value for key, value in action.items() if key not in sensed}
         wanted = layout.from_dict(known, dataclasses.replace(last, command=resting))
         self._last_action = loop.execute(wanted, 1 / self.config.fps)
-        if self._stage is not None:
-            self._session.outcome = self._stage.update()
+        outcome = None if self._stage is None else self._stage.update()
         executed = layout.to_dict(self._last_action)
-        self._session.executed = Executed(self._proprioception, executed)
+        # LeRobot also moves a robot that nobody has observed, back to its start: no tick then.
+        if (tick := self._session.tick) is not None:
+            self._session.put(dataclasses.replace(tick, executed=executed, outcome=outcome))
         return dict(executed)
 
     def disconnect(self) -> None:

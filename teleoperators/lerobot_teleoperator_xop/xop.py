@@ -263,8 +263,8 @@ class Xop(Teleoperator):
         """
         if not self._is_connected:
             raise NotConnected(type(self).__name__)
-        info, state = self._session.robot, self._session.state
-        if state is None:
+        info, tick = self._session.robot, self._session.tick
+        if tick is None:
             raise LinkError(
                 f"{info.name} in session '{self._session.name}' has published no state yet. "
                 "Call its get_observation() before get_action()."
@@ -274,11 +274,11 @@ class Xop(Teleoperator):
         if self._session.reset_count != self._resets_seen:
             self._resets_seen = self._session.reset_count
             self._teleoperation.reset(self._session.obstacles, self._session.episode)
-        self._teleoperation.see(self._session.view)
-        action, self._session.tick = self._teleoperation.step(state)
+        action, tick = self._teleoperation.step(tick)
+        self._session.put(tick)
         for wish in self._teleoperation.take_wishes():
             self._teleoperation.answer(*self._session.ask(wish))
-        self._teleoperation.show(self._session.progress, self._session.pictures)
+        self._teleoperation.show(self._session.progress)
         return info.morphology.layout.to_dict(action)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:

@@ -14,7 +14,8 @@ from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES
 from xop_lerobot.operator.display import SeenObject
 from xop_lerobot.operator.frame import OperatorFrame
-from xop_lerobot.tasks.task import TASKS, Task, TaskStatus
+from xop_lerobot.session import TaskStatus
+from xop_lerobot.tasks.task import TASKS, Task
 
 
 @TASKS.register("wait")

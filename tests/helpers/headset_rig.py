@@ -25,7 +25,7 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.session import RobotInfo, TickRecord
+from xop_lerobot.session import RobotInfo, Tick
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 POLICIES = {"g1": "default", "rby1": "diff_drive"}
@@ -55,7 +55,7 @@ def pass_on(t: float, frame: OperatorFrame) -> list[OperatorFrame]:
     return [frame]
 
 
-def get_goal(record: TickRecord) -> Goal:
+def get_goal(record: Tick) -> Goal:
     """The goal of a tick in which the operator drives."""
     assert record.goal is not None
     return record.goal
@@ -85,7 +85,7 @@ class Rig:
         device.clock = lambda: self.now
         self.teleop.connect()
         self.loop.reset(seed=0, settle_s=0.8)
-        self.ticks: list[tuple[RobotAction, TickRecord]] = []
+        self.ticks: list[tuple[RobotAction, Tick]] = []
         self.notices: list[str] = []
         self.troubles: list[str] = []
 
@@ -99,7 +99,7 @@ class Rig:
                     self._send(message)
                     self.sent += 1
                     wait_for(lambda: self.device.handled >= self.sent)
-            action, record = self.teleop.step(self.loop.state)
+            action, record = self.teleop.step(Tick(self.loop.state))
             self.loop.execute(action, 1 / FPS)
             self.ticks.append((action, record))
             self.notices.append(self.teleop.notice)

@@ -292,9 +292,9 @@ class XopToy(XopRobot):
 
 def get_state(robot: XopRobot) -> RobotState:
     """What the robot has published last."""
-    state = get_session(robot.config.session).state
-    assert state is not None
-    return state
+    tick = get_session(robot.config.session).tick
+    assert tick is not None
+    return tick.state
 
 
 def observe(robot: XopRobot) -> RobotState:

@@ -109,8 +109,12 @@ def _forward(head: np.ndarray) -> np.ndarray:
 
 
 def is_engaged() -> bool:
-    tick = get_session().tick
-    return tick is not None and tick.engaged
+    for _ in range(500):
+        tick = get_session().tick
+        if tick is None or tick.command is not None:
+            return tick is not None and tick.engaged
+        time.sleep(0.001)  # observed, and not decided yet
+    return False
 
 
 def test_lerobot_record_of_a_g1_in_real_time(tmp_path, monkeypatch):

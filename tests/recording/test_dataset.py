@@ -41,7 +41,7 @@ from xop_lerobot.recording.lerobot_patches import ROTATION, LeRobotMisfit
 from xop_lerobot.recording.opening import BatchedEncoding, DatasetExists, WrongFps
 from xop_lerobot.recording.record import build_features
 from xop_lerobot.recording.writer import MAX_IMAGES, VideoQueue
-from xop_lerobot.session import Executed, Outcome, TickRecord, get_session
+from xop_lerobot.session import TaskStatus, Tick, get_session
 
 REPO = Path(__file__).parents[2]
 POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"]
@@ -70,11 +70,17 @@ def create(session, robot, root, **options) -> XopDataset:
     return XopDataset.bind(session).create("local/toy", 25, features, root=root, **options)
 
 
-def tick(robot, teleop, dataset, act=None) -> None:
-    """One tick of LeRobot's loops; `act` stands in for the teleoperator, as a policy does."""
+def tick(robot, teleop, dataset, act=None, outcome: TaskStatus | None = None) -> None:
+    """One tick of LeRobot's loops; `act` stands in for the teleoperator, as a policy does.
+
+    The toy has no task: `outcome` stands in for the status of one.
+    """
     observation = robot.get_observation()
     action = act or teleop.get_action()
     robot.send_action(action)
+    link = get_session(robot.config.session)
+    assert link.tick is not None
+    link.put(dataclasses.replace(link.tick, outcome=outcome))
     frame = build_dataset_frame(dataset.features, observation, prefix=OBS_STR)
     frame |= build_dataset_frame(dataset.features, action, prefix=ACTION)
     dataset.add_frame({**frame, "task": "play"})
@@ -129,13 +135,12 @@ def make_frame() -> OperatorFrame:
     return OperatorFrame(1.0, *poses, pinch=np.array([0.01, 0.02]), tracked=np.array([1, 0, 1]))
 
 
-def make_tick(state, **changes) -> TickRecord:
+def make_tick(state, **changes) -> Tick:
     goal = Goal({"head": np.arange(7.0)}, mode=Mode.MOBILE)
-    record = TickRecord(
+    record = Tick(
         state=state,
         frame=make_frame(),
         goal=goal,
-        engaged=True,
         command=np.array([0.1, 0.2]),
         cost={"tracking": 1.0, "total": 1.5},
         health={"solve_time": 0.01, "plan_age": 0.04},
@@ -146,7 +151,7 @@ def make_tick(state, **changes) -> TickRecord:
 def test_row_says_what_the_tick_said(session, pair):
     state = observe(pair[0])
     columns = Columns(get_session(session).robot)
-    row = columns.build_row(state, make_tick(state), Outcome(success=True, done=False))
+    row = columns.build_row(make_tick(state, outcome=TaskStatus(success=True, done=False)))
     for key, value in row.items():
         assert value.dtype == columns.features[key]["dtype"], key
         assert value.shape == columns.features[key]["shape"], key
@@ -170,14 +175,14 @@ def test_robot_frames_are_those_of_the_simulation(session, pair):
         robot.get_observation()
         robot.send_action(teleop.get_action())
     state = observe(robot)
-    row = Columns(get_session(session).robot).build_row(state, None, None)
+    row = Columns(get_session(session).robot).build_row(Tick(state))
     for frame in FRAMES:
         assert row[f"robot.{frame}"] == pytest.approx(robot._plant.get_site_pose(frame), abs=1e-6)
 
 
 def test_row_without_a_teleoperator_is_zero_and_flagged(session, pair):
     state = observe(pair[0])
-    row = Columns(get_session(session).robot).build_row(state, None, None)
+    row = Columns(get_session(session).robot).build_row(Tick(state))
     assert not row["operator.engaged"].any()
     assert all(not row[key].any() for key in row if key.startswith(("operator", "goal")))
 
@@ -185,7 +190,7 @@ def test_row_without_a_teleoperator_is_zero_and_flagged(session, pair):
 def test_no_column_is_ever_nan(session, pair):
     state = observe(pair[0])
     record = make_tick(state, command=np.array([np.nan, 1]), cost={"tracking": np.inf})
-    row = Columns(get_session(session).robot).build_row(state, record, None)
+    row = Columns(get_session(session).robot).build_row(record)
     assert all(np.isfinite(value).all() for value in row.values())
     assert row["retargeter.command"].tolist() == [0, 1]
 
@@ -260,11 +265,9 @@ def test_tables_are_what_lerobot_writes(session, pair, tmp_path, monkeypatch, us
 def test_facts_of_an_episode(session, pair, tmp_path):
     robot, teleop = pair
     dataset = create(session, robot, tmp_path / "data")
-    get_session(session).outcome = None
-    for i in range(3):
-        tick(robot, teleop, dataset)
-        get_session(session).outcome = Outcome(success=i > 0, done=i > 0)
     tick(robot, teleop, dataset)
+    for i in range(3):
+        tick(robot, teleop, dataset, outcome=TaskStatus(success=i > 0, done=i > 0))
     dataset.save_episode()
     dataset.finalize()
     root = dataset.root
@@ -320,7 +323,9 @@ def test_the_action_is_what_the_robot_executes(session, pair, tmp_path):
 def test_actions_of_another_tick_or_robot_stay(session, pair, tmp_path):
     features = build_features(pair[0], use_videos=True)
     observation = pair[0].get_observation()
-    executed = Executed(observation, pair[1].get_action())
+    tick = get_session(session).tick
+    assert tick is not None
+    executed = dataclasses.replace(tick, executed=pair[1].get_action())
     state = build_dataset_frame(features, observation, prefix=OBS_STR)["observation.state"]
     asked = np.full(6, 9.0, np.float32)
     frame = {"observation.state": state, "action": asked}
@@ -347,18 +352,31 @@ def test_frames_that_were_kept_back_are_refused(session, pair, tmp_path):
         dataset.add_frame({**frame, "task": "play"})
 
 
+def test_a_frame_before_its_tick_is_complete_is_refused(session, pair, tmp_path):
+    robot, teleop = pair
+    dataset = create(session, robot, tmp_path / "data")
+    observation = robot.get_observation()
+    frame = build_dataset_frame(dataset.features, observation, prefix=OBS_STR)
+    frame |= build_dataset_frame(dataset.features, teleop.get_action(), prefix=ACTION)
+    with pytest.raises(LinkError, match=rf"call send_action\(\) of xop_toy in session '{session}'"):
+        dataset.add_frame({**frame, "task": "play"})
+    get_session(session).confirm_reset()
+    with pytest.raises(LinkError, match=r"call get_observation\(\) of xop_toy in session"):
+        dataset.add_frame({**frame, "task": "play"})
+    assert not dataset.has_pending_frames()
+
+
 def test_an_episode_ends_by_itself(session, pair, tmp_path):
     robot, teleop = pair
     dataset = create(session, robot, tmp_path / "data")
-    link, events = get_session(session), {"exit_early": False}
+    events = {"exit_early": False}
 
     def count() -> int:
         frames = 0
         while not events["exit_early"]:
-            tick(robot, teleop, dataset)
+            success = frames >= 3
+            tick(robot, teleop, dataset, outcome=TaskStatus(success=success, done=success))
             frames += 1
-            if frames == 3:
-                link.outcome = Outcome(success=True, done=True)
         events["exit_early"] = False
         dataset.clear_episode_buffer()
         return frames
@@ -768,8 +786,8 @@ def test_hardware_has_the_estimate_where_a_simulation_has_the_truth(session, pai
     state, info = observe(robot), get_session(session).robot
     estimate = np.array(state.qpos) + 0.01
     record = make_tick(state, estimate=estimate)
-    simulated = Columns(info).build_row(state, record, None)
-    real = Columns(dataclasses.replace(info, has_truth=False)).build_row(state, record, None)
+    simulated = Columns(info).build_row(record)
+    real = Columns(dataclasses.replace(info, has_truth=False)).build_row(record)
     np.testing.assert_allclose(simulated["robot.base_pose"], state.true_qpos[:7], atol=1e-6)
     np.testing.assert_allclose(real["robot.base_pose"], estimate[:7], atol=1e-6)
     assert real["robot.head"][0] == pytest.approx(simulated["robot.head"][0] + 0.01, abs=0.02)

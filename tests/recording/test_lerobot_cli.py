@@ -301,7 +301,8 @@ def test_settings_change_while_it_records(tmp_path, monkeypatch, command):
         """Change the preset as soon as some frames are recorded."""
         deadline = time.monotonic() + 120
         while time.monotonic() < deadline and len(answers) < 2:
-            if get_session().tick is None:
+            tick = get_session().tick
+            if tick is None or tick.command is None:
                 time.sleep(0.01)
                 continue
             try:

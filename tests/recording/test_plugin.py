@@ -367,9 +367,44 @@ def test_a_third_robot_is_driven(session, retargeter):
     assert tick.engaged
     assert tick.goal is not None
     assert tick.goal.mode in Mode
+    assert tick.command is not None
     assert tick.command.shape == (2,)
     moved = [action[f"{joint}.pos"] for joint in ARM_JOINTS]
     assert np.abs(moved).max() > 1e-3
+    teleop.disconnect()
+    robot.disconnect()
+
+
+def test_a_tick_grows_stage_by_stage(session):
+    robot, teleop = make_toy(session), make_teleop(session)
+    teleop.connect()
+    robot.connect()
+    link = get_session(session)
+    robot.send_action({})
+    assert link.tick is None  # nobody has observed it yet
+    robot.get_observation()
+    observed = link.tick
+    assert observed is not None
+    assert observed.command is None
+    assert observed.executed is None
+    action = teleop.get_action()
+    decided = link.tick
+    assert decided is not None
+    assert decided.state is observed.state
+    assert decided.command is not None
+    robot.send_action(action)
+    executed = link.tick
+    assert executed is not None
+    assert executed.command is decided.command
+    assert executed.executed == action
+    assert observed.command is None  # a tick that somebody holds does not change
+    robot.get_observation()
+    link.put(decided)  # too late: the next tick has begun
+    assert link.tick is not None
+    assert link.tick.command is None
+    link.confirm_reset()
+    link.put(decided)
+    assert link.tick is None
     teleop.disconnect()
     robot.disconnect()
 

@@ -28,7 +28,7 @@ from xop_lerobot.retarget.plan_follower import (
     predict_goal,
 )
 from xop_lerobot.retarget.rollout import PolicyRollout
-from xop_lerobot.session import RobotInfo
+from xop_lerobot.session import RobotInfo, Tick
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 SPACE = make_morphology("rby1").command_space
@@ -225,7 +225,7 @@ def follow(robot: str, delay: float, seed: int = 0, seconds: float = 5.0, *, com
     for _ in range(round(seconds / 0.04)):
         state = loop.state
         late.deliver(state.time)
-        action, record = teleop.step(state)
+        action, record = teleop.step(Tick(state))
         loop.execute(action, 0.04)
         head = teleop._compute_frames(state)["head"]
         assert record.goal is not None

@@ -24,11 +24,10 @@ from xop_lerobot.retarget.factory import make_retargeter
 from xop_lerobot.retarget.obstacles import Obstacle
 from xop_lerobot.retarget.plan import Retargeter
 from xop_lerobot.retarget.plan_follower import BackgroundPlanner
-from xop_lerobot.session import Session, get_session
+from xop_lerobot.session import Session, TaskStatus, Tick, get_session
 from xop_lerobot.tasks.dual_point_touch import TOLERANCE
 from xop_lerobot.tasks.furniture import place
 from xop_lerobot.tasks.stage import Stage
-from xop_lerobot.tasks.task import TaskStatus
 
 TASK = "dual_point_touch"
 
@@ -260,15 +259,22 @@ def test_robot_without_a_task_publishes_no_outcome():
     robot.connect()
     robot.get_observation()
     session = get_session("stage_none")
-    assert session.view is None
-    assert session.outcome is None
+    tick = get_tick(session)
+    assert tick.view is None
+    assert tick.outcome is None
     assert session.obstacles is None
     robot.disconnect()
 
 
+def get_tick(session: Session) -> Tick:
+    assert session.tick is not None
+    return session.tick
+
+
 def see(session: Session) -> View:
-    assert session.view is not None
-    return session.view
+    view = get_tick(session).view
+    assert view is not None
+    return view
 
 
 def test_robot_publishes_view_outcome_and_obstacles():
@@ -280,9 +286,10 @@ def test_robot_publishes_view_outcome_and_obstacles():
     assert see(session).task == TASK
     first = see(session).objects["left_point"].pose
     robot.send_action(teleop.get_action())
-    assert isinstance(session.outcome, TaskStatus)
-    assert session.outcome.done is False
-    assert session.outcome.figures["left_palm_distance"] > TOLERANCE
+    outcome = get_tick(session).outcome
+    assert isinstance(outcome, TaskStatus)
+    assert outcome.done is False
+    assert outcome.figures["left_palm_distance"] > TOLERANCE
     assert session.obstacles == ()
     session.begin_episode(1)
     robot.get_observation()

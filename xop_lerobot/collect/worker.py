@@ -26,7 +26,7 @@ from xop_lerobot.recording.host import own_loop
 from xop_lerobot.recording.lockstep import count_ticks
 from xop_lerobot.recording.record import build_features
 from xop_lerobot.recording.tick import run_tick
-from xop_lerobot.session import get_session
+from xop_lerobot.session import TaskStatus, get_session
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -74,7 +74,7 @@ class Collector:
             try:
                 self.begin(job, teleop, dataset)
                 frames = self._run(job, teleop, dataset)
-                outcome = self.session.outcome
+                outcome = self._outcome
                 success = outcome is not None and outcome.success
                 kept = success or not self.config.only_successful
                 if kept:
@@ -88,7 +88,7 @@ class Collector:
         return Attempt(
             index,
             success,
-            failure="" if success else str(getattr(outcome, "failure", "")),
+            failure="" if success or outcome is None else outcome.failure,
             kept=kept,
             frames=frames,
             run=self.run,
@@ -122,10 +122,16 @@ class Collector:
         while not events["exit_early"]:
             run_tick(self.robot, teleop, dataset, self.get_instruction(job, frames))
             frames += 1
-            outcome = self.session.outcome
+            outcome = self._outcome
             if outcome is not None and outcome.done:
                 break
         return frames
+
+    @property
+    def _outcome(self) -> TaskStatus | None:
+        """Status of the task after the last action."""
+        tick = self.session.tick
+        return None if tick is None else tick.outcome
 
     # What depends on the kind of collection.
 

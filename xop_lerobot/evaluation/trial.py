@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xop_lerobot.core.state import FRAMES, RobotState
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.evaluation.methods import make_retargeter_config, resolve_low_level
 from xop_lerobot.low_level.factory import make_policy, resolve_policy
 from xop_lerobot.morphology.morphology import make_morphology
@@ -25,8 +25,8 @@ from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.plan import Status
-from xop_lerobot.session import RobotInfo, TickRecord
-from xop_lerobot.tasks.task import TASKS, TaskStatus, make_task
+from xop_lerobot.session import RobotInfo, TaskStatus, Tick
+from xop_lerobot.tasks.task import TASKS, make_task
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 if TYPE_CHECKING:
@@ -188,16 +188,20 @@ class TraceRows:
     ticks: list[dict[str, Any]] = field(default_factory=list)
     solves: list[tuple[float, bool, bool]] = field(default_factory=list)
 
-    def add(
-        self, state: RobotState, command: np.ndarray, record: TickRecord, view: View | None = None
-    ) -> None:
-        """Add one tick; without a view, a trace has no frames and objects."""
-        goals = record.goal.poses if record.goal is not None else {}
+    def add(self, tick: Tick, command: np.ndarray) -> None:
+        """Add one tick; without a view, a trace has no frames and objects.
+
+        Args:
+            tick: The tick, decided.
+            command: What is executed of its command. Shape (k,).
+        """
+        state, view = tick.state, tick.view
+        goals = tick.goal.poses if tick.goal is not None else {}
         nothing = np.full(7, np.nan)
         self.ticks.append(
             {
                 "time": state.time,
-                "engaged": record.engaged,
+                "engaged": tick.engaged,
                 "mode": int(state.mode),
                 "qpos": state.true_qpos,
                 "qvel": state.true_qvel,
@@ -210,8 +214,8 @@ class TraceRows:
                 "collision": state.collision,
             }
         )
-        health = record.health
-        if record.engaged and health.get("plan_age", np.inf) == 0:
+        health = tick.health
+        if tick.engaged and health.get("plan_age", np.inf) == 0:
             failed, intervened = health.get("status", Status.OK), health.get("intervention", 0)
             self.solves.append((health.get("solve_time", 0.0), failed != Status.OK, intervened > 0))
 
@@ -292,7 +296,7 @@ def closed_loop(
 def run_trial(
     setup: TrialSetup,
     seed: int,
-    watch: Callable[[Stage, View, TickRecord], None] | None = None,
+    watch: Callable[[Stage, View, Tick], None] | None = None,
 ) -> Trial:
     """Run one episode.
 
@@ -331,7 +335,7 @@ def _drive(
     loop: PolicyLoop,
     teleoperation: Teleoperation,
     begin: float,
-    watch: Callable[[Stage, View, TickRecord], None] | None,
+    watch: Callable[[Stage, View, Tick], None] | None,
 ) -> Trial:
     """Close the loop until the task is over."""
     rows, filming = TraceRows(), _Filming(stage, setup.fps)
@@ -341,14 +345,13 @@ def _drive(
     while True:
         state = loop.state
         view = stage.view(state)
-        teleoperation.see(view)
-        action, record = teleoperation.step(state)
-        if record.engaged and np.isnan(engaged_at):
+        action, tick = teleoperation.step(Tick(state, view=view))
+        if tick.engaged and np.isnan(engaged_at):
             engaged_at = state.time
-        rows.add(state, action.command, record, view)
+        rows.add(tick, action.command)
         filming.note()
         if watch is not None:
-            watch(stage, view, record)
+            watch(stage, view, tick)
         loop.execute(action, dt)
         status = stage.update()
         if status.success and np.isnan(succeeded_at):

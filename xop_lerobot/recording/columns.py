@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.core.state import FRAMES, RobotState
+from xop_lerobot.core.state import FRAMES
 from xop_lerobot.morphology.body import Body
 from xop_lerobot.retarget.costs import COSTS
-from xop_lerobot.session import Outcome, RobotInfo, TickRecord
+from xop_lerobot.session import RobotInfo, Tick
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 COST_NAMES = (*(cost.name for cost in COSTS), "total")
@@ -71,26 +71,22 @@ class Columns:
             "next.done": _feature("bool", ("done",)),
         }
 
-    def build_row(
-        self, state: RobotState, tick: TickRecord | None, outcome: Outcome | None
-    ) -> dict[str, np.ndarray]:
+    def build_row(self, tick: Tick) -> dict[str, np.ndarray]:
         """Build the columns of one frame.
 
         Args:
-            state: State at the beginning of the tick.
-            tick: What the teleoperator did in it, None when something else drove the robot.
-            outcome: Outcome of the task after the tick, None where no task runs.
+            tick: The tick of the frame; without a decision, something else drove the robot.
 
         Returns:
             An array for every feature, of its very dtype and shape.
         """
-        frame = tick.frame if tick else None
-        goals = tick.goal.poses if tick and tick.goal else {}
-        done = (outcome is not None and outcome.done) or (tick is not None and tick.finished)
+        state, frame, outcome = tick.state, tick.frame, tick.outcome
+        goals = tick.goal.poses if tick.goal else {}
+        done = tick.finished or (outcome is not None and outcome.done)
         values: dict[str, object] = {
-            "operator.engaged": tick is not None and tick.engaged,
-            "retargeter.cost": _pick(COST_NAMES, tick.cost if tick else {}),
-            "retargeter.health": _pick(HEALTH_NAMES, tick.health if tick else {}),
+            "operator.engaged": tick.engaged,
+            "retargeter.cost": _pick(COST_NAMES, tick.cost),
+            "retargeter.health": _pick(HEALTH_NAMES, tick.health),
             "robot.effort": state.effort,
             "time.sim": state.time,
             "time.wall": round(state.wall_time * 1e9),
@@ -100,17 +96,17 @@ class Columns:
         if frame is not None:
             values |= {f"operator.{name}": frame.pose(name) for name in FRAMES}
             values |= {"operator.pinch": frame.pinch, "operator.tracked": frame.tracked}
-        if tick is not None:
+        if tick.command is not None:
             values["retargeter.command"] = tick.command
         values |= {f"goal.{name}": pose for name, pose in goals.items()}
-        poses = self._body.compute_poses(self._find_position(state, tick))
+        poses = self._body.compute_poses(self._find_position(tick))
         values |= {f"robot.{name}": pose for name, pose in poses.items()}
         return {key: _cast(values.get(key), spec) for key, spec in self.features.items()}
 
-    def _find_position(self, state: RobotState, tick: TickRecord | None) -> np.ndarray:
+    def _find_position(self, tick: Tick) -> np.ndarray:
         """Where the robot is: in truth, else as synchronised, else as measured. Shape (nq,)."""
-        if self._has_truth or tick is None or tick.estimate is None:
-            return state.true_qpos
+        if self._has_truth or tick.estimate is None:
+            return tick.state.true_qpos
         return tick.estimate
 
 

@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Self, cast
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from xop_lerobot.core.errors import BadValue, XopError
+from xop_lerobot.core.errors import BadValue, LinkError, XopError
 from xop_lerobot.core.shutdown import hold_signals
 from xop_lerobot.core.state import RobotState
 from xop_lerobot.operator.display import Cue, Progress, Wish
@@ -64,7 +64,7 @@ from xop_lerobot.recording.rollback import (
     taken_back_on_failure,
 )
 from xop_lerobot.recording.writer import VideoQueue, keep_schedule, skip_embedding
-from xop_lerobot.session import RobotInfo, Session, TickRecord, get_session
+from xop_lerobot.session import RobotInfo, Session, Tick, get_session
 
 logger = logging.getLogger(__name__)
 
@@ -291,8 +291,8 @@ class XopDataset(LeRobotDataset):
 
     def grant(self, wish: Wish) -> tuple[Cue, str]:
         """Do with the episode what the operator asks for; return what to tell the operator."""
-        state = self._session.state
-        time = 0.0 if state is None else state.time
+        tick = self._session.tick
+        time = 0.0 if tick is None else tick.state.time
         told = grant(wish, self._events, self._tally, paused=self._paused, time=time)
         progress = self._session.progress
         if progress is not None:
@@ -303,22 +303,14 @@ class XopDataset(LeRobotDataset):
         """Add a frame with this tick's extra columns, and the action that the robot executes.
 
         Raises:
+            LinkError: If the robot was not observed before the frame, or has executed no action.
             BadValue: If the frame is of an earlier tick, whose columns nobody knows any more.
             NotSaved: If it cannot be written; a full disk is the usual reason.
         """
-        session, tally = self._session, self._tally
-        state, outcome = session.state, session.outcome
-        tick = self._current_tick()
-        frame = put_executed(frame, session.executed, self.meta.features)
-        if self._columns is not None and state is not None:
-            if state is self._last_state:
-                raise BadValue(
-                    "a frame came late: another one of the same tick is recorded already. "
-                    "--strategy.type=highlight keeps frames back, and their columns are gone then; "
-                    "use another strategy, or --teleop.record.columns=false"
-                )
-            self._last_state = state
-            frame = {**frame, **self._columns.build_row(state, tick, outcome)}
+        tally, tick = self._tally, self._session.tick
+        frame = put_executed(frame, tick, self.meta.features)
+        if self._columns is not None:
+            frame = {**frame, **self._columns.build_row(self._check_order(tick))}
         if not self._info.realtime:
             self._video.wait()
         self._video.wait_for_images()
@@ -328,9 +320,8 @@ class XopDataset(LeRobotDataset):
         except Exception as error:
             raise_if_not_written(self, error)
             raise
-        if state is not None:
-            tally.note_state(state)
         if tick is not None:
+            tally.note_state(tick.state)
             tally.note_changes(tick)
             tally.driven |= tick.engaged
 
@@ -338,6 +329,7 @@ class XopDataset(LeRobotDataset):
         if tally.frames == 0:
             tally.first, tally.start_time = tally.last, time.time()
         tally.frames += 1
+        outcome = None if tick is None else tick.outcome
         tally.success = outcome is not None and outcome.success
         if tally.marked is not None:
             tally.success = tally.marked
@@ -346,14 +338,23 @@ class XopDataset(LeRobotDataset):
         if is_over or (self._stop_on_success and tally.success):
             self._events["exit_early"] = True
         length = tally.frames / self.fps
-        session.progress = Progress(self.num_episodes, tally.frames, length, tally.success)
+        self._session.progress = Progress(self.num_episodes, tally.frames, length, tally.success)
 
-    def _current_tick(self) -> TickRecord | None:
-        """The teleoperator's record of this very tick, None if a policy drove the robot."""
-        session = self._session
-        tick, state = session.tick, session.state
-        if tick is None or state is None or tick.state.time != state.time:
-            return None
+    def _check_order(self, tick: Tick | None) -> Tick:
+        """Check that a frame of `tick` can be recorded now; see `add_frame`."""
+        if tick is None or tick.executed is None:
+            missing = "get_observation()" if tick is None else "send_action()"
+            raise LinkError(
+                f"a frame came before its tick was complete: call {missing} of {self._info.name} "
+                f"in session '{self._session.name}' before each add_frame()"
+            )
+        if tick.state is self._last_state:
+            raise BadValue(
+                "a frame came late: another one of the same tick is recorded already. "
+                "--strategy.type=highlight keeps frames back, and their columns are gone then; "
+                "use another strategy, or --teleop.record.columns=false"
+            )
+        self._last_state = tick.state
         return tick
 
     def save_episode(

@@ -9,11 +9,11 @@ import numpy as np
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 if TYPE_CHECKING:
-    from xop_lerobot.session import Executed
+    from xop_lerobot.session import Tick
 
 
 def put_executed(
-    frame: Mapping[str, Any], executed: Executed | None, features: Mapping[str, Mapping[str, Any]]
+    frame: Mapping[str, Any], tick: Tick | None, features: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
     """Put what the robot executes in the place of the action of a frame.
 
@@ -25,14 +25,14 @@ def put_executed(
 
     Args:
         frame: The frame.
-        executed: What the robot executes of its last action, None if it was sent none.
+        tick: The session's present tick, None if there is none.
         features: Columns of the dataset.
     """
     frame = dict(frame)
-    if executed is None:
+    if tick is None or tick.executed is None:
         return frame
-    state = _build(OBS_STATE, executed.observation, features)
-    action = _build(ACTION, executed.action, features)
+    state = _build(OBS_STATE, tick.proprioception, features)
+    action = _build(ACTION, tick.executed, features)
     if state is None or action is None or OBS_STATE not in frame:
         return frame
     if np.array_equal(state, frame[OBS_STATE]):

@@ -9,7 +9,7 @@ import numpy as np
 
 from xop_lerobot.core.state import RobotState
 from xop_lerobot.operator.display import Cue, Wish
-from xop_lerobot.session import TickRecord
+from xop_lerobot.session import Tick
 
 
 class Tally:
@@ -43,7 +43,7 @@ class Tally:
         self.changes: list[dict[str, Any]] = []
         self._trouble = ""
 
-    def note_changes(self, tick: TickRecord) -> None:
+    def note_changes(self, tick: Tick) -> None:
         """Take down what came into force with the frame that is being added."""
         if self.frames == 0:
             self.settings = dict(tick.settings)

@@ -10,6 +10,7 @@ import numpy as np
 
 from xop_lerobot.core.transforms import make_pose, quat_conjugate, quat_from_yaw, quat_rotate
 from xop_lerobot.operator.display import SeenObject
+from xop_lerobot.session import TaskStatus
 from xop_lerobot.tasks import furniture
 from xop_lerobot.tasks.furniture import ROBOT, Touching, compute_speed, compute_tilt
 from xop_lerobot.tasks.heights import HeightRange
@@ -20,7 +21,7 @@ from xop_lerobot.tasks.layout import (
     measure_pad,
     measure_reach,
 )
-from xop_lerobot.tasks.task import Hold, Task, TaskStatus
+from xop_lerobot.tasks.task import Hold, Task
 
 if TYPE_CHECKING:
     import mujoco

@@ -10,10 +10,11 @@ import numpy as np
 
 from xop_lerobot.core.transforms import quat_from_yaw
 from xop_lerobot.operator.display import SeenObject
+from xop_lerobot.session import TaskStatus
 from xop_lerobot.tasks.furniture import add_furniture_body, add_look, get_body_pose, place
 from xop_lerobot.tasks.heights import HeightRange
 from xop_lerobot.tasks.layout import find_palms, find_room, make_direction, measure_reach
-from xop_lerobot.tasks.task import Hold, Task, TaskStatus
+from xop_lerobot.tasks.task import Hold, Task
 
 if TYPE_CHECKING:
     import mujoco

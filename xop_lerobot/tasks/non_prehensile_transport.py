@@ -18,10 +18,11 @@ from xop_lerobot.core.transforms import (
     quat_multiply,
 )
 from xop_lerobot.operator.display import SeenObject
+from xop_lerobot.session import TaskStatus
 from xop_lerobot.tasks import furniture, palm
 from xop_lerobot.tasks.furniture import ROBOT, Touching, compute_speed, compute_tilt
 from xop_lerobot.tasks.layout import find_palms, make_direction, measure_pad, measure_reach
-from xop_lerobot.tasks.task import Hold, Task, TaskStatus
+from xop_lerobot.tasks.task import Hold, Task
 
 if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology

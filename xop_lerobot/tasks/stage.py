@@ -13,8 +13,9 @@ from xop_lerobot.operator.display import View
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.simulation import Simulation
 from xop_lerobot.retarget.obstacles import Obstacle, make_obstacles
+from xop_lerobot.session import TaskStatus
 from xop_lerobot.tasks.layout import add_task_camera, find_palms
-from xop_lerobot.tasks.task import Task, TaskStatus, make_task
+from xop_lerobot.tasks.task import Task, make_task
 
 if TYPE_CHECKING:
     from xop_lerobot.core.state import RobotState

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from xop_lerobot.core.registry import Registry
 from xop_lerobot.operator.display import SeenObject
-from xop_lerobot.session import Outcome
+from xop_lerobot.session import TaskStatus
 from xop_lerobot.tasks.heights import HeightRange, check_heights, parse_heights
 
 if TYPE_CHECKING:
@@ -19,24 +18,6 @@ if TYPE_CHECKING:
 
     from xop_lerobot.morphology.morphology import Morphology
     from xop_lerobot.plant.simulation import Simulation
-
-
-@dataclass(frozen=True)
-class TaskStatus(Outcome):
-    """Status of an episode, decided by the physics alone.
-
-    Attributes:
-        failure: Why the episode is lost, in words; empty while it is not.
-        picked_up: Whether the object was held up for long enough.
-        figures: Further figures of the episode by name, fit for JSON.
-        collisions: What of the robot touched which wall or piece of furniture so far, other than
-            the hands where the task is for them to.
-    """
-
-    failure: str = ""
-    picked_up: bool = False
-    figures: Mapping[str, float] = field(default_factory=dict)
-    collisions: tuple[tuple[str, str], ...] = ()
 
 
 class Task(ABC):
