@@ -23,8 +23,7 @@ from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.errors import XopError
 from xop_lerobot.core.transforms import make_pose
 from xop_lerobot.operator.dataset_recording import is_dataset, load_dataset_recording
-from xop_lerobot.operator.engagement import Clutch
-from xop_lerobot.operator.engagement import Wish as ClutchWish
+from xop_lerobot.operator.engagement import Clutch, ClutchRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import GestureConfig, Hands
 from xop_lerobot.operator.recording import Recording, load_recording
@@ -83,8 +82,8 @@ def count(frames: Iterator[OperatorFrame]) -> tuple[float, int, Counter[str]]:
         asked = hands.read(frame)
         counts["mode"] += asked.mode
         counts["upright"] += bool(asked.toggle)
-        counts.update(wish.value for wish in asked.wishes)
-        if clutch.update(frame, engaged) is not ClutchWish.NOTHING:
+        counts.update(request.value for request in asked.requests)
+        if clutch.update(frame, engaged) is not ClutchRequest.NOTHING:
             counts["engage"] += 1
             engaged = not engaged
     hours = 0.0 if first is None or last is None else (last - first) / 3600

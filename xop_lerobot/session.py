@@ -18,7 +18,7 @@ import numpy as np
 from xop_lerobot.core.errors import LinkError
 from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.morphology.morphology import list_robot_types
-from xop_lerobot.operator.display import Cue, Progress, View, Wish
+from xop_lerobot.operator.display import Cue, Progress, RecordingRequest, View
 from xop_lerobot.operator.frame import OperatorFrame
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ class Tick:
 class Recorder(Protocol):
     """Who records the session."""
 
-    def grant(self, wish: Wish) -> tuple[Cue, str]:
+    def grant(self, request: RecordingRequest) -> tuple[Cue, str]:
         """Do what the operator asks for; return what the operator is told."""
         ...
 
@@ -226,11 +226,11 @@ class Session:
             if self.tick is not None and self.tick.state is tick.state:
                 self.tick = tick
 
-    def ask(self, wish: Wish) -> tuple[Cue, str]:
-        """Ask the recorder for `wish`; return what the operator is told."""
+    def ask(self, request: RecordingRequest) -> tuple[Cue, str]:
+        """Put `request` to the recorder; return what the operator is told."""
         if self.recorder is None:
             return Cue.REFUSED, "Nothing is recorded."
-        return self.recorder.grant(wish)
+        return self.recorder.grant(request)
 
     def _forget(self) -> None:
         self.tick = self.obstacles = None

@@ -20,7 +20,7 @@ from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.operator.alignment import Alignment, AlignmentConfig
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DeviceConfig, make_device
-from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, Wish
+from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, RecordingRequest
 from xop_lerobot.operator.engagement import Clutch, Engagement
 from xop_lerobot.operator.feedback import list_warnings, tell_changes
 from xop_lerobot.operator.frame import OperatorFrame
@@ -68,7 +68,7 @@ class Teleoperation:
 
     While nobody is engaged (`Engagement`), the robot is asked to hold the posture it is in; the
     next engagement aligns anew, so no command ever makes a step. `change` changes settings
-    meanwhile. What the operator asks of the recording is there in `take_wishes`, and the answer
+    meanwhile. What the operator asks of the recording is there in `take_requests`, and the answer
     is given with `answer`.
 
     Args:
@@ -128,7 +128,7 @@ class Teleoperation:
         self._engagement.reset()
         self._velocity.reset()
         self._hands.reset()
-        self._wishes: deque[Wish] = deque(maxlen=8)
+        self._requests: deque[RecordingRequest] = deque(maxlen=8)
         self._smoother.reset()
         if self._sync is not None:
             self._sync.reset()
@@ -228,14 +228,14 @@ class Teleoperation:
         shown, notices = self._shown, self._board.notices
         self.device.show(dataclasses.replace(shown, notices=notices, progress=progress))
 
-    def take_wishes(self) -> tuple[Wish, ...]:
+    def take_requests(self) -> tuple[RecordingRequest, ...]:
         """What the operator asks of the recording since the last call, by gestures or buttons."""
-        wishes = tuple(self._wishes)
-        self._wishes.clear()
-        return (*wishes, *self.device.take_wishes())
+        requests = tuple(self._requests)
+        self._requests.clear()
+        return (*requests, *self.device.take_requests())
 
     def answer(self, cue: Cue, text: str) -> None:
-        """Tell the operator what has become of a wish."""
+        """Tell the operator what has become of a request."""
         self._board.tell(cue, text)
 
     @property
@@ -385,8 +385,8 @@ class Teleoperation:
     def _describe_hold(self, engaged: bool) -> tuple[str, float]:
         """What the gesture that is held will do, in words, and how much of it has passed."""
         raised = self._hands.raised
-        if raised.wish is not None:
-            return HOLDING[raised.wish], raised.progress
+        if raised.request is not None:
+            return HOLDING[raised.request], raised.progress
         progress = self._engagement.progress
         if progress <= 0:
             return "", 0.0
@@ -395,7 +395,7 @@ class Teleoperation:
     def _read_gestures(self, frame: OperatorFrame | None) -> None:
         """Do what the operator's hands say, whether the operator drives or not."""
         asked = self._hands.read(frame)
-        self._wishes += asked.wishes
+        self._requests += asked.requests
         if asked.mode:
             self._mode = Mode(1 - self._mode)
         if asked.toggle:

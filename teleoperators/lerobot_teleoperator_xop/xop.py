@@ -276,8 +276,8 @@ class Xop(Teleoperator):
             self._teleoperation.reset(self._session.obstacles, self._session.episode)
         action, tick = self._teleoperation.step(tick)
         self._session.put(tick)
-        for wish in self._teleoperation.take_wishes():
-            self._teleoperation.answer(*self._session.ask(wish))
+        for request in self._teleoperation.take_requests():
+            self._teleoperation.answer(*self._session.ask(request))
         self._teleoperation.show(self._session.progress)
         return info.morphology.layout.to_dict(action)
 

@@ -11,9 +11,8 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.webxr import WebXrDevice
-from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, Wish
-from xop_lerobot.operator.engagement import Clutch
-from xop_lerobot.operator.engagement import Wish as ClutchWish
+from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress, RecordingRequest
+from xop_lerobot.operator.engagement import Clutch, ClutchRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import Gesture, GestureConfig, GestureReader
 
@@ -35,7 +34,7 @@ class Desk:
 
     Attributes:
         frames: What was read in each tick.
-        wishes: What was asked for of the recording.
+        requests: What was asked for of the recording.
         changes: Changes of what is shown, as fields of `Display`; tests set them.
     """
 
@@ -51,7 +50,7 @@ class Desk:
         self.board = NoticeBoard()
         self.engaged, self.mode = False, Mode.STATIONARY
         self.frames: list[OperatorFrame | None] = []
-        self.wishes: list[Wish] = []
+        self.requests: list[RecordingRequest] = []
         self.changes: dict = {"progress": Progress(3, 310, 12.4, False)}
         self.pictures = {"head": make_picture()}
         self._stop = threading.Event()
@@ -95,14 +94,14 @@ class Desk:
                 pictures=self.pictures if len(self.frames) % 8 == 1 else {},
             )
             self.device.show(Display(**{**vars(shown), **self.changes}))
-            self.wishes += self.device.take_wishes()
+            self.requests += self.device.take_requests()
 
     def _follow(self, frame: OperatorFrame | None) -> None:
-        wish = self.clutch.update(frame, self.engaged)
-        if wish is ClutchWish.ENGAGE:
+        request = self.clutch.update(frame, self.engaged)
+        if request is ClutchRequest.ENGAGE:
             self.engaged = True
             self.board.post(Cue.ENGAGED, "Engaged: the robot follows you.")
-        elif wish is ClutchWish.LET_GO:
+        elif request is ClutchRequest.LET_GO:
             self.engaged = False
             self.board.post(Cue.DISENGAGED, "Disengaged: you have let go.")
         if frame is not None and self.reader.update(frame) is Gesture.DOUBLE_PINCH:

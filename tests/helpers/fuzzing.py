@@ -136,7 +136,7 @@ class _Driver:
                 if self._last is not None:
                     self._gap = max(self._gap, now - self._heard)
                 self._last, self._heard = frame.time, now
-        self._device.take_wishes()
+        self._device.take_requests()
         self._device.show(Display(time.monotonic(), pictures={"head": self._picture}))
 
     def report(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import make_pose, quat_exp, quat_multiply
-from xop_lerobot.operator.engagement import Clutch, ClutchConfig, Wish
+from xop_lerobot.operator.engagement import Clutch, ClutchConfig, ClutchRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.goal import HandBlend
 from xop_lerobot.operator.recording import load_recording
@@ -33,15 +33,15 @@ def make_frame(
 
 
 def drive(frames, clutch: Clutch | None = None, engaged: bool = False, grants: bool = True):
-    """What becomes of it when every wish is granted: stamps of engaging and letting go."""
+    """What becomes of it when every request is granted: stamps of engaging and letting go."""
     clutch = clutch or Clutch()
     events = []
     for frame in frames:
-        wish = clutch.update(frame, engaged)
-        if wish is not Wish.NOTHING:
-            events.append((round(frame.time, 2), wish))
+        request = clutch.update(frame, engaged)
+        if request is not ClutchRequest.NOTHING:
+            events.append((round(frame.time, 2), request))
             if grants:
-                engaged = wish is Wish.ENGAGE
+                engaged = request is ClutchRequest.ENGAGE
     return events
 
 
@@ -56,13 +56,13 @@ def hold(*spans: tuple[float, float], rate: float = 50, end: float = 6.0, **fiel
 @pytest.mark.parametrize("rate", [25, 30, 50, 90, 120])
 def test_a_held_gesture_engages_and_the_next_one_lets_go(rate):
     events = drive(hold((1, 2.3), (4, 5.5), rate=rate))
-    assert [wish for _, wish in events] == [Wish.ENGAGE, Wish.LET_GO]
+    assert [request for _, request in events] == [ClutchRequest.ENGAGE, ClutchRequest.LET_GO]
     for (stamp, _), start in zip(events, (1, 4), strict=True):
         assert start + 0.95 <= stamp <= start + 1.0 + 2 / rate + 0.01
 
 
 def test_one_long_hold_does_one_thing():
-    assert [wish for _, wish in drive(hold((1, 6)))] == [Wish.ENGAGE]
+    assert [request for _, request in drive(hold((1, 6)))] == [ClutchRequest.ENGAGE]
 
 
 @pytest.mark.parametrize(
@@ -90,16 +90,16 @@ def test_both_pinch_needs_no_palms():
 
 def test_it_asks_until_it_is_granted():
     events = drive(hold((1, 3)), grants=False)
-    assert {wish for _, wish in events} == {Wish.ENGAGE}
+    assert {request for _, request in events} == {ClutchRequest.ENGAGE}
     assert events[0][0] == pytest.approx(2, abs=0.05)
     assert events[-1][0] == pytest.approx(3, abs=0.05)
 
 
 def test_a_lost_head_or_no_frame_lets_go_at_once():
     lost = make_frame(0.1, closed=False, tracked=(0, 1, 1))
-    assert Clutch().update(lost, engaged=True) is Wish.LET_GO
-    assert Clutch().update(lost, engaged=False) is Wish.NOTHING
-    assert Clutch().update(None, engaged=True) is Wish.LET_GO
+    assert Clutch().update(lost, engaged=True) is ClutchRequest.LET_GO
+    assert Clutch().update(lost, engaged=False) is ClutchRequest.NOTHING
+    assert Clutch().update(None, engaged=True) is ClutchRequest.LET_GO
 
 
 def test_who_was_lost_must_open_the_hands_first():
@@ -107,7 +107,7 @@ def test_who_was_lost_must_open_the_hands_first():
     frames = hold((1, 6))
     frames[120] = dataclasses.replace(frames[120], tracked=np.zeros(3, dtype=bool))
     events = drive(frames, clutch)
-    assert [wish for _, wish in events] == [Wish.ENGAGE, Wish.LET_GO]
+    assert [request for _, request in events] == [ClutchRequest.ENGAGE, ClutchRequest.LET_GO]
 
 
 def test_frames_that_come_again_change_nothing():

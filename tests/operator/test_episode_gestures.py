@@ -14,7 +14,7 @@ from tests.recording.test_lerobot_cli import ROBOT, record_flags, run
 from xop_lerobot.core.transforms import make_pose, quat_from_rpy
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices import DEVICES, DeviceConfig
-from xop_lerobot.operator.display import Cue, Display, Wish
+from xop_lerobot.operator.display import Cue, Display, RecordingRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.recording.facts import read_facts
 from xop_lerobot.recording.requests import Tally, grant
@@ -177,17 +177,17 @@ def make_tally(**fields) -> Tally:
     return tally
 
 
-def ask(wish: Wish, tally: Tally | None = None, *, paused=False, discarded=False):
+def ask(request: RecordingRequest, tally: Tally | None = None, *, paused=False, discarded=False):
     events = {"exit_early": False, "rerecord_episode": discarded, "stop_recording": False}
-    cue, text = grant(wish, events, tally or make_tally(), paused=paused, time=0.4)
+    cue, text = grant(request, events, tally or make_tally(), paused=paused, time=0.4)
     return cue, text, {name for name, value in events.items() if value}
 
 
-def test_wishes_are_granted_as_keys_are():
-    assert ask(Wish.END)[2] == {"exit_early"}
-    assert ask(Wish.REDO)[2] == {"exit_early", "rerecord_episode"}
-    assert ask(Wish.STOP)[2] == {"exit_early", "stop_recording"}
-    assert ask(Wish.SUCCESS)[2] == set()
+def test_requests_are_granted_as_keys_are():
+    assert ask(RecordingRequest.END)[2] == {"exit_early"}
+    assert ask(RecordingRequest.REDO)[2] == {"exit_early", "rerecord_episode"}
+    assert ask(RecordingRequest.STOP)[2] == {"exit_early", "stop_recording"}
+    assert ask(RecordingRequest.SUCCESS)[2] == set()
 
 
 def test_a_second_mark_takes_the_first_one_off():
@@ -196,26 +196,26 @@ def test_a_second_mark_takes_the_first_one_off():
         (True, "The episode is marked as a success."),
         (False, "The episode is not marked as a success any more."),
     ):
-        assert ask(Wish.SUCCESS, tally)[:2] == (Cue.SUCCESS, text)
+        assert ask(RecordingRequest.SUCCESS, tally)[:2] == (Cue.SUCCESS, text)
         assert (tally.success, tally.marked) == (success, success)
     # Also where the task itself has found a success that is none.
     tally = make_tally(success=True)
-    ask(Wish.SUCCESS, tally)
+    ask(RecordingRequest.SUCCESS, tally)
     assert tally.success is False
     assert [each["change"] for each in tally.changes] == [{"success": False}]
 
 
 def test_what_is_refused_says_why():
     idle = make_tally(driven=False)
-    assert ask(Wish.END, idle) == (
+    assert ask(RecordingRequest.END, idle) == (
         Cue.REFUSED, "Not ended: nothing has been driven in this episode yet.", set()
     )  # fmt: skip
-    assert ask(Wish.SUCCESS, idle)[0] is Cue.REFUSED
-    assert ask(Wish.REDO, idle)[0] is Cue.REDO  # the robot may have fallen by itself
-    for wish, text in (
-        (Wish.SUCCESS, "Not marked: the episode has been discarded."),
-        (Wish.REDO, "The episode has been discarded already."),
+    assert ask(RecordingRequest.SUCCESS, idle)[0] is Cue.REFUSED
+    assert ask(RecordingRequest.REDO, idle)[0] is Cue.REDO  # the robot may have fallen by itself
+    for request, text in (
+        (RecordingRequest.SUCCESS, "Not marked: the episode has been discarded."),
+        (RecordingRequest.REDO, "The episode has been discarded already."),
     ):
-        told = ask(wish, paused=True, discarded=True)
+        told = ask(request, paused=True, discarded=True)
         assert told == (Cue.REFUSED, text, {"rerecord_episode"})
-    assert ask(Wish.STOP, paused=True, discarded=True)[1] == "Stop: the session ends."
+    assert ask(RecordingRequest.STOP, paused=True, discarded=True)[1] == "Stop: the session ends."

@@ -17,7 +17,7 @@ from headset_rig import POLICIES, RATE, Fault, Rig
 from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_yaw
 from xop_lerobot.operator.devices import DeviceConfig
-from xop_lerobot.operator.engagement import Clutch, Wish
+from xop_lerobot.operator.engagement import Clutch, ClutchRequest
 from xop_lerobot.operator.frame import OperatorFrame
 
 pytestmark = pytest.mark.slow
@@ -175,8 +175,8 @@ def test_let_go_by_the_gesture_and_replay(make_rig):
 
     clutch, engaged, again = Clutch(), False, []
     for _, record in rig.ticks:
-        wish = clutch.update(record.frame, engaged)
-        engaged = engaged if wish is Wish.NOTHING else wish is Wish.ENGAGE
+        request = clutch.update(record.frame, engaged)
+        engaged = engaged if request is ClutchRequest.NOTHING else request is ClutchRequest.ENGAGE
         again.append(engaged)
     assert again == [record.engaged for _, record in rig.ticks]
     assert sum(np.diff(np.array(again, dtype=int)) == 1) == 2

@@ -19,9 +19,8 @@ from xop_lerobot.core.transforms import (
     quat_multiply,
     quat_rotate,
 )
-from xop_lerobot.operator.display import Wish
-from xop_lerobot.operator.engagement import Clutch
-from xop_lerobot.operator.engagement import Wish as ClutchWish
+from xop_lerobot.operator.display import RecordingRequest
+from xop_lerobot.operator.engagement import Clutch, ClutchRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import GestureConfig, Hands, explain_gestures
 from xop_lerobot.operator.raised_hands import RaisedHands, RaisedHandsConfig
@@ -82,47 +81,49 @@ def make_frames(
     return frames
 
 
-def find_wishes(frames: Iterable[OperatorFrame], reader=None) -> list[tuple[float, Wish]]:
+def find_requests(
+    frames: Iterable[OperatorFrame], reader=None
+) -> list[tuple[float, RecordingRequest]]:
     reader = reader or RaisedHands()
-    wishes = []
+    requests = []
     for frame in frames:
-        wish = reader.update(frame)
-        if wish is not None:
-            wishes.append((round(frame.time, 2), wish))
-    return wishes
+        request = reader.update(frame)
+        if request is not None:
+            requests.append((round(frame.time, 2), request))
+    return requests
 
 
 UP, HELD = [(1.0, 6.0)], [(2.0, 5.0)]
 GESTURES = {
-    Wish.END: (([], UP), ([], HELD), 1.0),
-    Wish.REDO: ((UP, []), (HELD, []), 2.0),
-    Wish.STOP: ((UP, UP), (HELD, HELD), 2.0),
+    RecordingRequest.END: (([], UP), ([], HELD), 1.0),
+    RecordingRequest.REDO: ((UP, []), (HELD, []), 2.0),
+    RecordingRequest.STOP: ((UP, UP), (HELD, HELD), 2.0),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [25, 30, 50, 90, 120])
-@pytest.mark.parametrize("wish", list(GESTURES))
-def test_a_raised_hand_that_pinches_asks_once(wish, rate):
-    raised, pinched, length = GESTURES[wish]
-    ((stamp, asked),) = find_wishes(make_frames(raised, pinched, rate=rate))
-    assert asked is wish
+@pytest.mark.parametrize("wanted", list(GESTURES))
+def test_a_raised_hand_that_pinches_asks_once(wanted, rate):
+    raised, pinched, length = GESTURES[wanted]
+    ((stamp, asked),) = find_requests(make_frames(raised, pinched, rate=rate))
+    assert asked is wanted
     assert 2 + length - 0.01 <= stamp <= 2 + length + 2 / rate + 0.01
 
 
 @pytest.mark.parametrize("heading", [-2.5, -1.0, 1.5, 3.1])
 def test_wherever_the_person_faces(heading):
-    raised, pinched, _ = GESTURES[Wish.END]
-    assert len(find_wishes(make_frames(raised, pinched, heading=heading))) == 1
+    raised, pinched, _ = GESTURES[RecordingRequest.END]
+    assert len(find_requests(make_frames(raised, pinched, heading=heading))) == 1
 
 
 @pytest.mark.parametrize(
     "tilt", [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.6, 0), (0, -0.6, 0), (0, 0, 0.6)]
 )
 def test_a_hand_need_not_be_straight(tilt):
-    raised, pinched, _ = GESTURES[Wish.REDO]
+    raised, pinched, _ = GESTURES[RecordingRequest.REDO]
     turn = quat_multiply(HALT, quat_exp(np.array(tilt)))
-    assert len(find_wishes(make_frames(raised, pinched, turn=turn))) == 1
+    assert len(find_requests(make_frames(raised, pinched, turn=turn))) == 1
 
 
 NOTHING: dict[str, Callable[[], list[OperatorFrame]]] = {
@@ -144,37 +145,37 @@ NOTHING: dict[str, Callable[[], list[OperatorFrame]]] = {
 
 @pytest.mark.parametrize("what", list(NOTHING))
 def test_what_asks_nothing(what):
-    assert find_wishes(NOTHING[what]()) == []
+    assert find_requests(NOTHING[what]()) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(ORIENTATIONS))
 def test_other_hands_ask_nothing(name):
     for raised, pinched, _ in GESTURES.values():
-        assert find_wishes(make_frames(raised, pinched, turn=ORIENTATIONS[name])) == []
+        assert find_requests(make_frames(raised, pinched, turn=ORIENTATIONS[name])) == []
 
 
 def test_one_long_hold_asks_once_and_the_next_begins_with_an_open_hand():
     frames = make_frames(([], [(1, 9)]), ([], [(2, 6), (6.3, 8)]), end=9)
-    assert [wish for _, wish in find_wishes(frames)] == [Wish.END, Wish.END]
+    assert [request for _, request in find_requests(frames)] == [RecordingRequest.END] * 2
 
 
 def test_frames_that_come_again_change_nothing_and_a_clock_that_goes_back_starts_anew():
-    raised, pinched, _ = GESTURES[Wish.STOP]
+    raised, pinched, _ = GESTURES[RecordingRequest.STOP]
     frames = make_frames(raised, pinched)
-    assert find_wishes([f for f in frames for _ in range(3)]) == find_wishes(frames)
+    assert find_requests([f for f in frames for _ in range(3)]) == find_requests(frames)
     reader = RaisedHands()
-    assert len(find_wishes(frames, reader)) == len(find_wishes(frames, reader)) == 1
+    assert len(find_requests(frames, reader)) == len(find_requests(frames, reader)) == 1
 
 
 def test_progress_is_shown_while_it_is_held():
     reader = RaisedHands()
-    raised, pinched, _ = GESTURES[Wish.REDO]
+    raised, pinched, _ = GESTURES[RecordingRequest.REDO]
     shown = []
     for frame in make_frames(raised, pinched):
         reader.update(frame)
-        shown.append((reader.wish, reader.progress))
-    held = [progress for wish, progress in shown if wish is Wish.REDO]
+        shown.append((reader.request, reader.progress))
+    held = [progress for request, progress in shown if request is RecordingRequest.REDO]
     assert len(held) == pytest.approx(2 * RATE, abs=2)
     assert (np.diff(held) > 0).all()
     assert shown[-1] == (None, 0.0)
@@ -184,15 +185,14 @@ def test_the_clutch_and_raised_hands_keep_apart():
     for raised, pinched, _ in GESTURES.values():
         clutch = Clutch()
         frames = make_frames(raised, pinched)
-        assert all(clutch.update(frame, True) is ClutchWish.NOTHING for frame in frames)
+        assert all(clutch.update(frame, True) is ClutchRequest.NOTHING for frame in frames)
 
 
 def test_hands_are_chosen_by_the_configuration():
     config = RaisedHandsConfig(end="left", redo="right", stop="none")
-    assert [w for _, w in find_wishes(make_frames((UP, []), (HELD, [])), RaisedHands(config))] == [
-        Wish.END
-    ]
-    assert find_wishes(make_frames((UP, UP), (HELD, HELD)), RaisedHands(config)) == []
+    found = find_requests(make_frames((UP, []), (HELD, [])), RaisedHands(config))
+    assert [request for _, request in found] == [RecordingRequest.END]
+    assert find_requests(make_frames((UP, UP), (HELD, HELD)), RaisedHands(config)) == []
     with pytest.raises(UnknownName, match="unknown gestures.raised.end 'foot'. Known: both, "):
         RaisedHandsConfig(end="foot")
     with pytest.raises(BadValue, match=r"end and redo must not have the same hand \(left\)"):
@@ -214,20 +214,20 @@ def read(frames: Iterable[OperatorFrame], config: GestureConfig | None = None, p
     return (
         sum(each.mode for each in asked),
         [each.toggle for each in asked if each.toggle],
-        [wish for each in asked for wish in each.wishes],
+        [request for each in asked for request in each.requests],
     )
 
 
 def test_each_hand_has_its_double_pinch():
     none = ([], [])
     assert read(make_frames(none, (DOUBLE, []), end=3)) == (1, [], [])
-    assert read(make_frames(none, ([], DOUBLE), end=3)) == (0, [], [Wish.SUCCESS])
+    assert read(make_frames(none, ([], DOUBLE), end=3)) == (0, [], [RecordingRequest.SUCCESS])
     assert read(make_frames(none, (DOUBLE, DOUBLE), end=3)) == (0, ["upright"], [])
     late = [(a + 0.3, b + 0.3) for a, b in DOUBLE]
     assert read(make_frames(none, (DOUBLE, late), end=3)) == (0, ["upright"], [])
     assert read(make_frames(none, (late, DOUBLE), end=3)) == (0, ["upright"], [])
     later = [(a + 2, b + 2) for a, b in DOUBLE]
-    assert read(make_frames(none, (later, DOUBLE), end=5)) == (1, [], [Wish.SUCCESS])
+    assert read(make_frames(none, (later, DOUBLE), end=5)) == (1, [], [RecordingRequest.SUCCESS])
     config = GestureConfig(other_double_pinch="none", both_double_pinch="none")
     assert read(make_frames(none, ([], DOUBLE), end=3), config) == (0, [], [])
     assert read(make_frames(none, (DOUBLE, DOUBLE), end=3), config) == (0, [], [])
@@ -236,9 +236,9 @@ def test_each_hand_has_its_double_pinch():
 
 
 def test_recordings_ask_nothing_of_the_recording_that_is_made_now():
-    raised, pinched, _ = GESTURES[Wish.END]
+    raised, pinched, _ = GESTURES[RecordingRequest.END]
     frames = make_frames(raised, pinched) + make_frames(([], []), ([], DOUBLE))
-    assert read(frames)[2] == [Wish.END, Wish.SUCCESS]
+    assert read(frames)[2] == [RecordingRequest.END, RecordingRequest.SUCCESS]
     assert read(frames, person=False)[2] == []
 
 

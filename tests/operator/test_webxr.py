@@ -22,7 +22,7 @@ from xop_lerobot.core.errors import BadValue
 from xop_lerobot.core.transforms import quat_from_matrix, quat_rotate
 from xop_lerobot.operator.devices import DeviceConfig, make_device
 from xop_lerobot.operator.devices.webxr import PortTaken, WebXrDevice
-from xop_lerobot.operator.display import Cue, Display, Notice, Progress, Wish
+from xop_lerobot.operator.display import Cue, Display, Notice, Progress, RecordingRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.client import ClockOffset
 from xop_lerobot.operator.webxr.delay_meter import MAX_FRAMES, DelayMeter
@@ -196,7 +196,7 @@ def test_messages_that_are_none(text, reason):
 
 def test_other_messages():
     assert parse_message('{"type": "pong", "id": 3, "t": 250}') == Pong(3, 0.25)
-    assert parse_message('{"type": "wish", "wish": "redo"}') is Wish.REDO
+    assert parse_message('{"type": "wish", "wish": "redo"}') is RecordingRequest.REDO
     long = "the headset was\ntaken off " + "x" * 1000
     farewell = parse_message(json.dumps({"type": "bye", "reason": long}))
     assert isinstance(farewell, Bye)
@@ -369,19 +369,19 @@ def test_show_never_waits_for_those_who_do_not_read(device, page):
     slow.close()
 
 
-def test_wishes(device, page):
+def test_requests(device, page):
     page.send({"type": "wish", "wish": "end"})
     onlooker = Page(device, "monitor")
     onlooker.wait_for("welcome")
-    wait_for(lambda: len(device._wishes) == 1)
+    wait_for(lambda: len(device._requests) == 1)
     onlooker.send({"type": "wish", "wish": "success"})
-    wait_for(lambda: len(device._wishes) == 2)
-    assert device.take_wishes() == (Wish.END, Wish.SUCCESS)
-    assert device.take_wishes() == ()
+    wait_for(lambda: len(device._requests) == 2)
+    assert device.take_requests() == (RecordingRequest.END, RecordingRequest.SUCCESS)
+    assert device.take_requests() == ()
     for _ in range(50):
         page.send({"type": "wish", "wish": "redo"})
     send(page, device, "{}")
-    assert len(device.take_wishes()) == 8
+    assert len(device.take_requests()) == 8
     onlooker.close()
 
 

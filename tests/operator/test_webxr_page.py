@@ -19,7 +19,7 @@ from ports import find_port
 
 from xop_lerobot.core.command import Mode
 from xop_lerobot.core.transforms import quat_rotate
-from xop_lerobot.operator.display import Cue, Progress, Wish
+from xop_lerobot.operator.display import Cue, Progress, RecordingRequest
 from xop_lerobot.operator.frame import OperatorFrame
 
 pytestmark = pytest.mark.slow
@@ -174,9 +174,9 @@ def test_every_cue_has_a_sound_of_its_own(desk, open_at):
 def test_buttons_ask_for_things_of_the_recording(desk, open_at):
     page = open_at(desk.address)
     page.wait_for_selector("[data-wish=end]:enabled")
-    for wish in (Wish.END, Wish.SUCCESS, Wish.STOP):
-        page.click(f"[data-wish={wish.value}]")
-        wait_for(lambda wish=wish: desk.wishes[-1:] == [wish], wish.value)
+    for request in (RecordingRequest.END, RecordingRequest.SUCCESS, RecordingRequest.STOP):
+        page.click(f"[data-wish={request.value}]")
+        wait_for(lambda request=request: desk.requests[-1:] == [request], request.value)
     page.click("[data-wish=redo]")  # which cannot be undone, so it takes two
     assert page.inner_text("[data-wish=redo]") == "Press again"
     page.wait_for_function(
@@ -185,8 +185,8 @@ def test_buttons_ask_for_things_of_the_recording(desk, open_at):
     page.evaluate(
         "() => { for (let i = 0; i < 2; i++) document.querySelector('[data-wish=redo]').click(); }"
     )
-    wait_for(lambda: len(desk.wishes) == 4, "redo")
-    assert desk.wishes[-1] is Wish.REDO
+    wait_for(lambda: len(desk.requests) == 4, "redo")
+    assert desk.requests[-1] is RecordingRequest.REDO
     wait_text(page, "connection", "Connected: you watch")
 
 

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.operator.display import Display, View, Wish
+from xop_lerobot.operator.display import Display, RecordingRequest, View
 from xop_lerobot.operator.frame import OperatorFrame
 
 
@@ -66,6 +66,6 @@ class Device(ABC):
         """Display robot and recording to the operator, once a tick; headsets only."""
         del display
 
-    def take_wishes(self) -> tuple[Wish, ...]:
+    def take_requests(self) -> tuple[RecordingRequest, ...]:
         """Requests to the recorder, by buttons, since the last call."""
         return ()

@@ -33,7 +33,7 @@ class Cue(Enum):
     SUCCESS = "success"
 
 
-class Wish(Enum):
+class RecordingRequest(Enum):
     """Request of the operator concerning the episode being recorded."""
 
     END = "end"

@@ -65,7 +65,7 @@ class ClutchConfig:
             raise BadValue(f"clutch.on must be below off, got {self.on} and {self.off}")
 
 
-class Wish(Enum):
+class ClutchRequest(Enum):
     """Request of the clutch."""
 
     NOTHING = "nothing"
@@ -100,7 +100,7 @@ class Clutch:
         self.progress = 0.0
         """How much of `hold` has passed, from 0 to 1."""
 
-    def update(self, frame: OperatorFrame | None, engaged: bool) -> Wish:
+    def update(self, frame: OperatorFrame | None, engaged: bool) -> ClutchRequest:
         """Take one sample.
 
         Frames with the stamp of the last one change nothing; a stamp that goes back starts anew.
@@ -113,15 +113,15 @@ class Clutch:
             self._spent, self._engaged = True, engaged
         if frame is None or not frame.tracked[0]:
             self._stop()
-            return Wish.LET_GO if engaged else Wish.NOTHING
+            return ClutchRequest.LET_GO if engaged else ClutchRequest.NOTHING
         if self._time is not None and frame.time < self._time:
             self.reset()
             self._engaged = engaged
         if frame.time != self._time:
             self._follow(frame)
         if self._spent or self.progress < 1:
-            return Wish.NOTHING
-        return Wish.LET_GO if engaged else Wish.ENGAGE
+            return ClutchRequest.NOTHING
+        return ClutchRequest.LET_GO if engaged else ClutchRequest.ENGAGE
 
     def _stop(self) -> None:
         self._time = self._wrists = self._since = None
@@ -279,18 +279,18 @@ class Engagement:
         poses: Mapping[str, np.ndarray],
     ) -> None:
         """Engage and disengage on the gesture of the person in the headset."""
-        wish = clutch.update(frame, self.is_engaged)
+        request = clutch.update(frame, self.is_engaged)
         if self.is_engaged:
             if state.fallen:
                 self._let_go("the robot has fallen")
             elif state.trouble:
                 self.disengage()  # what is wrong is told whether anybody drives or not
-            elif wish is Wish.LET_GO and (frame is None or is_lost(frame)):
+            elif request is ClutchRequest.LET_GO and (frame is None or is_lost(frame)):
                 self._let_go(self.device.trouble or UNSEEN)
-            elif wish is Wish.LET_GO:
+            elif request is ClutchRequest.LET_GO:
                 self._let_go("you have let go")
             return
-        if wish is not Wish.ENGAGE or frame is None:
+        if request is not ClutchRequest.ENGAGE or frame is None:
             return
         if state.fallen:
             self._refuse("Not engaged: the robot has fallen. It engages when it stands.")

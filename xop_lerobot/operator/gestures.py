@@ -15,7 +15,7 @@ import numpy as np
 
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.yaml_words import fill_nulls, find_word
-from xop_lerobot.operator.display import Wish
+from xop_lerobot.operator.display import RecordingRequest
 from xop_lerobot.operator.engagement import ClutchConfig
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.raised_hands import RaisedHands, RaisedHandsConfig
@@ -298,7 +298,7 @@ class Asked(NamedTuple):
     """To toggle the mode."""
     toggle: str = ""
     """To toggle a constraint or a preset of this name; empty for none."""
-    wishes: tuple[Wish, ...] = ()
+    requests: tuple[RecordingRequest, ...] = ()
     """What is asked of the recording."""
 
 
@@ -323,15 +323,15 @@ class Hands:
 
     def read(self, frame: OperatorFrame | None) -> Asked:
         """Take the frame of a tick, None before the first."""
-        wishes = []
-        if self._has_person and (wish := self.raised.update(frame)) is not None:
-            wishes.append(wish)
+        requests = []
+        if self._has_person and (request := self.raised.update(frame)) is not None:
+            requests.append(request)
         pinched = None if frame is None else self._pinches.update(frame)
         both, other = self._config.both_double_pinch, self._config.other_double_pinch
         if pinched is Gesture.OTHER_DOUBLE_PINCH and self._has_person and other == "success":
-            wishes.append(Wish.SUCCESS)
+            requests.append(RecordingRequest.SUCCESS)
         toggles = pinched is Gesture.BOTH_DOUBLE_PINCH and both != "none"
-        return Asked(pinched is Gesture.DOUBLE_PINCH, both if toggles else "", tuple(wishes))
+        return Asked(pinched is Gesture.DOUBLE_PINCH, both if toggles else "", tuple(requests))
 
 
 def explain_gestures(config: GestureConfig) -> dict[str, str]:

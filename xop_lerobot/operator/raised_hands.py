@@ -10,7 +10,7 @@ import numpy as np
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.transforms import compute_heading, quat_from_yaw, quat_rotate
 from xop_lerobot.core.yaml_words import fill_nulls, find_word
-from xop_lerobot.operator.display import Wish
+from xop_lerobot.operator.display import RecordingRequest
 from xop_lerobot.operator.frame import OperatorFrame
 
 RAISED = ("left", "right", "both", "none")
@@ -19,11 +19,15 @@ UPRIGHT, STILL_UPRIGHT = 0.7, 0.5
 """Fingers point so far up, and the palm so far forward, as a sine: 45°, and 30° to go on."""
 BELOW_EYES = 0.5
 """A raised wrist is no farther below the eyes [m]."""
-WISHES = {"end": Wish.END, "redo": Wish.REDO, "stop": Wish.STOP}
+REQUESTS = {
+    "end": RecordingRequest.END,
+    "redo": RecordingRequest.REDO,
+    "stop": RecordingRequest.STOP,
+}
 HOLDING = {
-    Wish.END: "Hold on to end the episode",
-    Wish.REDO: "Hold on to discard the episode",
-    Wish.STOP: "Hold on to stop the session",
+    RecordingRequest.END: "Hold on to end the episode",
+    RecordingRequest.REDO: "Hold on to discard the episode",
+    RecordingRequest.STOP: "Hold on to stop the session",
 }
 """What somebody who holds a gesture is told."""
 
@@ -62,10 +66,10 @@ class RaisedHandsConfig:
             BadValue: If a number is not above 0, `on` is not below `off`, or the same hands
                 are raised for two things.
         """
-        for name in WISHES:
+        for name in REQUESTS:
             setattr(self, name, find_word(getattr(self, name), RAISED))
         fill_nulls(self)
-        hands = {name: getattr(self, name) for name in WISHES}
+        hands = {name: getattr(self, name) for name in REQUESTS}
         for name, which in hands.items():
             if which not in RAISED:
                 raise UnknownName(f"gestures.raised.{name}", which, RAISED)
@@ -139,8 +143,8 @@ class RaisedHands:
     def __init__(self, config: RaisedHandsConfig | None = None) -> None:
         self.config = config or RaisedHandsConfig()
         c = self.config
-        self._wishes = {getattr(c, name): wish for name, wish in WISHES.items()}
-        self._wishes.pop("none", None)
+        self._requests = {getattr(c, name): request for name, request in REQUESTS.items()}
+        self._requests.pop("none", None)
         self._hands = [_Hand(name, c) for name in WRISTS]
         self.reset()
 
@@ -152,13 +156,13 @@ class RaisedHands:
     def _stop(self) -> None:
         for hand in self._hands:
             hand.reset()
-        self.wish: Wish | None = None
+        self.request: RecordingRequest | None = None
         """What the gesture that is held asks for, None if none is held."""
         self._since = 0.0
         self.progress = 0.0
         """How much of its hold has passed, from 0 to 1."""
 
-    def update(self, frame: OperatorFrame | None) -> Wish | None:
+    def update(self, frame: OperatorFrame | None) -> RecordingRequest | None:
         """Take one sample; return its request, once per gesture.
 
         Frames with the stamp of the last one change nothing; a stamp that goes back starts anew.
@@ -180,27 +184,27 @@ class RaisedHands:
             hand.follow(frame, forward, float(pinch))
         return self._hold(frame.time)
 
-    def _hold(self, time: float) -> Wish | None:
-        wish = self._find_wish()
-        if wish is not self.wish:
-            self.wish, self._since = wish, time
-        if wish is None:
+    def _hold(self, time: float) -> RecordingRequest | None:
+        request = self._find_request()
+        if request is not self.request:
+            self.request, self._since = request, time
+        if request is None:
             self.progress = 0.0
             return None
-        length = self.config.hold if wish is Wish.END else self.config.long_hold
+        length = self.config.hold if request is RecordingRequest.END else self.config.long_hold
         # Stamps add up rounding; a microsecond must not cost a sample.
         self.progress = min((time - self._since + 1e-6) / length, 1.0)
         if self.progress < 1:
             return None
         for hand in self._hands:
             hand.spend()
-        self.wish, self.progress = None, 0.0
-        return wish
+        self.request, self.progress = None, 0.0
+        return request
 
-    def _find_wish(self) -> Wish | None:
+    def _find_request(self) -> RecordingRequest | None:
         """Present request of the hands; all raised hands must be closed."""
         raised = [hand.raised for hand in self._hands]
         if not any(raised) or [hand.closed for hand in self._hands] != raised:
             return None
         which = "both" if all(raised) else "left" if raised[0] else "right"
-        return self._wishes.get(which)
+        return self._requests.get(which)

@@ -25,7 +25,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from xop_lerobot.core.errors import BadValue, LinkError, XopError
 from xop_lerobot.core.shutdown import hold_signals
 from xop_lerobot.core.state import RobotState
-from xop_lerobot.operator.display import Cue, Progress, Wish
+from xop_lerobot.operator.display import Cue, Progress, RecordingRequest
 from xop_lerobot.recording import writer
 from xop_lerobot.recording.columns import Columns, has_all_columns, is_own_column
 from xop_lerobot.recording.executed import put_executed
@@ -289,11 +289,11 @@ class XopDataset(LeRobotDataset):
         if progress is not None:
             self._session.progress = dataclasses.replace(progress, paused=True)
 
-    def grant(self, wish: Wish) -> tuple[Cue, str]:
+    def grant(self, request: RecordingRequest) -> tuple[Cue, str]:
         """Do with the episode what the operator asks for; return what to tell the operator."""
         tick = self._session.tick
         time = 0.0 if tick is None else tick.state.time
-        told = grant(wish, self._events, self._tally, paused=self._paused, time=time)
+        told = grant(request, self._events, self._tally, paused=self._paused, time=time)
         progress = self._session.progress
         if progress is not None:
             self._session.progress = dataclasses.replace(progress, success=self._tally.success)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from xop_lerobot.core.state import RobotState
-from xop_lerobot.operator.display import Cue, Wish
+from xop_lerobot.operator.display import Cue, RecordingRequest
 from xop_lerobot.session import Tick
 
 
@@ -86,7 +86,12 @@ class Tally:
 
 
 def grant(
-    wish: Wish, events: MutableMapping[str, bool], tally: Tally, *, paused: bool, time: float
+    request: RecordingRequest,
+    events: MutableMapping[str, bool],
+    tally: Tally,
+    *,
+    paused: bool,
+    time: float,
 ) -> tuple[Cue, str]:
     """Do what is asked for, or say why not.
 
@@ -95,7 +100,7 @@ def grant(
     end, and a session that stops does not keep it.
 
     Args:
-        wish: What is asked for.
+        request: What is asked for.
         events: The events of the recording loop; they are set here.
         tally: Of the episode.
         paused: Whether this is the pause after the episode.
@@ -104,17 +109,17 @@ def grant(
     Returns:
         What the operator is told: that it is done, or `Cue.REFUSED` and why not.
     """
-    match wish:
-        case Wish.SUCCESS:
+    match request:
+        case RecordingRequest.SUCCESS:
             return _mark(events, tally, paused, time)
-        case Wish.END:
+        case RecordingRequest.END:
             return _end(events, tally, paused)
-        case Wish.REDO:
+        case RecordingRequest.REDO:
             if paused and events["rerecord_episode"]:
                 return Cue.REFUSED, "The episode has been discarded already."
             events["rerecord_episode"] = events["exit_early"] = True
             return Cue.REDO, "Redo: the episode is discarded, and recorded again."
-        case Wish.STOP:
+        case RecordingRequest.STOP:
             return _stop(events, tally, paused)
 
 

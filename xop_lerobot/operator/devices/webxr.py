@@ -17,7 +17,7 @@ from xop_lerobot.core.command_line import can_print_anything
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.live import SILENT_S, LiveDevice, StreamStatus
-from xop_lerobot.operator.display import Display, Wish
+from xop_lerobot.operator.display import Display, RecordingRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.addresses import is_loopback, list_hosts, make_url, write_invitation
 from xop_lerobot.operator.webxr.certificate import Certificate, get_certificate
@@ -65,7 +65,7 @@ class WebXrDevice(LiveDevice):
         self._pictures = PictureEncoder()
         self._display: Display | None = None
         self._read: OperatorFrame | None = None
-        self._wishes: deque[Wish] = deque(maxlen=8)
+        self._requests: deque[RecordingRequest] = deque(maxlen=8)
         self._delay = DelayMeter(config.max_delay_s)
         self._was_late = False
         self._listener: socket.socket | None = None
@@ -133,9 +133,9 @@ class WebXrDevice(LiveDevice):
         if display.pictures:
             self._pictures.give(display.pictures)
 
-    def take_wishes(self) -> tuple[Wish, ...]:
+    def take_requests(self) -> tuple[RecordingRequest, ...]:
         """What was asked for on the page since the last call."""
-        return tuple(self._wishes.popleft() for _ in range(len(self._wishes)))
+        return tuple(self._requests.popleft() for _ in range(len(self._requests)))
 
     @property
     def status(self) -> StreamStatus:
@@ -202,9 +202,9 @@ class WebXrDevice(LiveDevice):
         else:
             self.receive(message.frame, message.sent)
 
-    def wish(self, wish: Wish) -> None:
+    def request(self, request: RecordingRequest) -> None:
         """Receive a request of the operator to the recorder."""
-        self._wishes.append(wish)
+        self._requests.append(request)
 
     def write_shown(self, role: str) -> list[str]:
         """Messages with the present display."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from xop_lerobot.core.transforms import make_pose, quat_from_matrix, quat_multiply, quat_rotate
 from xop_lerobot.operator.axes import WORLD
-from xop_lerobot.operator.display import Display, Wish
+from xop_lerobot.operator.display import Display, RecordingRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.stream import NORM_TOLERANCE, OPEN_PINCH
 
@@ -88,7 +88,7 @@ class Bye:
     reason: str
 
 
-Message = FrameMessage | Pong | Wish | Bye
+Message = FrameMessage | Pong | RecordingRequest | Bye
 
 
 def parse_message(text: str) -> Message | str:
@@ -114,9 +114,9 @@ def _parse_pong(values: Mapping[str, Any]) -> Pong | str:
     return Pong(number, sent / 1e3)
 
 
-def _parse_wish(values: Mapping[str, Any]) -> Wish | str:
+def _parse_request(values: Mapping[str, Any]) -> RecordingRequest | str:
     try:
-        return Wish(values.get("wish"))
+        return RecordingRequest(values.get("wish"))
     except ValueError:
         return "bad_wish"
 
@@ -157,7 +157,7 @@ def _parse_frame(values: Mapping[str, Any]) -> FrameMessage | str:
 _PARSERS: dict[str, Callable[[Mapping[str, Any]], Message | str]] = {
     "frame": _parse_frame,
     "pong": _parse_pong,
-    "wish": _parse_wish,
+    "wish": _parse_request,
     "bye": _parse_bye,
 }
 

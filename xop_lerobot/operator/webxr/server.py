@@ -13,7 +13,7 @@ from aiohttp import WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from xop_lerobot.core.paced_log import PacedLog
-from xop_lerobot.operator.display import Wish
+from xop_lerobot.operator.display import RecordingRequest
 from xop_lerobot.operator.webxr.certificate import Certificate
 from xop_lerobot.operator.webxr.client import Client
 from xop_lerobot.operator.webxr.pairing import Connections, Door, Handler
@@ -81,7 +81,7 @@ class Wearer(Protocol):
         """Count a message that holds no frame."""
         ...
 
-    def wish(self, wish: Wish) -> None:
+    def request(self, request: RecordingRequest) -> None:
         """Receive a request of the operator to the recorder."""
         ...
 
@@ -263,8 +263,8 @@ class HeadsetServer:
         if isinstance(message, Pong):
             client.take_pong(message)
             return None
-        if isinstance(message, Wish):  # of whoever stands by, too
-            self._wearer.wish(message)
+        if isinstance(message, RecordingRequest):  # of whoever stands by, too
+            self._wearer.request(message)
         elif client is not self._operator:
             return "monitors look on"
         elif isinstance(message, str):
