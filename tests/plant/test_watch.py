@@ -196,7 +196,7 @@ def test_the_operator_is_told_and_the_arms_go_back_to_rest(name, monkeypatch):
         "Disengaged: it stands, its arms go back to rest."
     )
     assert rig.teleop._board.notices[-1].cue is Cue.DISENGAGED
-    shown = rig.teleop._shown
+    shown = rig.teleop._feedback.shown
     assert shown is not None
     assert "The robot moves though it is told to stand." in shown.warnings
     first = rig.loop.state.arms

@@ -1,15 +1,22 @@
-"""Feedback to the operator in words: changes and warnings."""
+"""Feedback to the operator: notices of trouble and changes, held gestures and warnings."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import RobotState
 from xop_lerobot.operator.device import Device
 from xop_lerobot.operator.devices.live import HANDS, LiveDevice
-from xop_lerobot.operator.display import Cue, NoticeBoard
+from xop_lerobot.operator.display import Cue, Display, NoticeBoard, Progress
+from xop_lerobot.operator.engagement import Engagement
 from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.raised_hands import HOLDING, RaisedHands
 
 if TYPE_CHECKING:
     from xop_lerobot.retarget.changes import Change
@@ -19,6 +26,88 @@ SLOW_HZ = 25.0
 """Rate of a stream under which gestures are missed [Hz]."""
 LATE_S = 0.3
 """Age of a plan from which the robot lags behind what is asked of it [s]."""
+
+
+class Feedback:
+    """What the operator is told, and shown in each tick.
+
+    Attributes:
+        board: The last notices.
+        shown: Content of the display but for notices and progress, None before the first tick.
+    """
+
+    def __init__(self) -> None:
+        self.board = NoticeBoard()
+        self.reset()
+
+    def reset(self) -> None:
+        """Start over; the notices stay."""
+        self._trouble = ""
+        self.shown: Display | None = None
+
+    @property
+    def notice(self) -> str:
+        """What the operator was told last; empty if nothing was."""
+        notices = self.board.notices
+        return notices[-1].text if notices else ""
+
+    def tell_trouble(self, trouble: str, *, engaged: bool, retreats: bool) -> None:
+        """Tell what the robot has begun to do that it was not told to.
+
+        Args:
+            trouble: That, in words; empty if nothing.
+            engaged: Whether the operator has driven until now.
+            retreats: Whether its arms go back to rest for it.
+        """
+        if trouble and trouble != self._trouble:
+            text = trouble[:1].upper() + trouble[1:]
+            ends = "Disengaged: it" if engaged else "It"
+            does = "stands, its arms go back to rest" if retreats else "holds"
+            self.board.tell(Cue.DISENGAGED, f"{text}. {ends} {does}.")
+        self._trouble = trouble
+
+    def note(
+        self,
+        state: RobotState,
+        frame: OperatorFrame | None,
+        engagement: Engagement,
+        raised: RaisedHands,
+        *,
+        mode: Mode,
+        plan_age: float | None,
+        pictures: Mapping[str, np.ndarray],
+    ) -> None:
+        """Take down what `show` shows of a tick.
+
+        Args:
+            state: The robot now.
+            frame: The operator now, None before the first frame.
+            engagement: Whether the operator drives, and how long the clutch has been held.
+            raised: Reader of raised hands.
+            mode: Mode that is asked for.
+            plan_age: Age of the plan that is followed [s], None where there is none.
+            pictures: What the robot's cameras see, by name. Shapes (height, width, 3), uint8.
+        """
+        engaged, trouble = engagement.is_engaged, state.trouble
+        holding, progress = describe_hold(raised, engagement.progress, engaged=engaged)
+        self.shown = Display(
+            time=state.time,
+            engaged=engaged,
+            mode=mode,
+            clutch=progress,
+            holding=holding,
+            warnings=list_warnings(
+                engagement.device, frame, engaged=engaged, plan_age=plan_age, trouble=trouble
+            ),
+            fallen=state.fallen,
+            pictures=pictures,
+        )
+
+    def show(self, device: Device, progress: Progress | None) -> None:
+        """Show the tick on `device`, with how far a recording is (None without one)."""
+        if self.shown is not None:
+            notices = self.board.notices
+            device.show(dataclasses.replace(self.shown, notices=notices, progress=progress))
 
 
 def tell_changes(board: NoticeBoard, changes: Iterable[AppliedChange]) -> None:
@@ -48,6 +137,24 @@ def describe_settings(change: Change) -> str:
         parts.append(f"body {', '.join(change.body) or 'whole'}")
     text = "; ".join(parts)
     return text[:1].upper() + text[1:]
+
+
+def describe_hold(raised: RaisedHands, clutch: float, *, engaged: bool) -> tuple[str, float]:
+    """Describe the gesture that is held.
+
+    Args:
+        raised: Reader of raised hands, which go before the clutch.
+        clutch: How much of the clutch's hold has passed, from 0 to 1.
+        engaged: Whether the operator drives.
+
+    Returns:
+        What it will do, in words, and how much of its hold has passed; empty and 0 without one.
+    """
+    if raised.request is not None:
+        return HOLDING[raised.request], raised.progress
+    if clutch <= 0:
+        return "", 0.0
+    return f"Hold on to {'let go' if engaged else 'engage'}", clutch
 
 
 def list_warnings(

@@ -1,4 +1,4 @@
-"""Goals: their velocity, and blending when a lost hand is found again."""
+"""Goals: their making, their velocity, and blending when a lost hand is found again."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue
-from xop_lerobot.core.state import FRAMES
+from xop_lerobot.core.state import FRAMES, Goal
 from xop_lerobot.core.transforms import (
     compute_minimum_jerk,
     level_pose,
@@ -20,6 +21,9 @@ from xop_lerobot.core.transforms import (
     quat_multiply,
     rotation_error,
 )
+from xop_lerobot.operator.alignment import Alignment
+from xop_lerobot.operator.frame import OperatorFrame
+from xop_lerobot.operator.gestures import grip_from_pinch
 
 BLEND_S = 1.0
 """Time in which a hand's goal goes from where it was held to where the hand is [s]."""
@@ -228,6 +232,58 @@ class GoalVelocity:
         velocity = self._velocities[name]
         gain = -math.expm1(-dt / self.config.time_constant)
         return velocity + gain * (np.concatenate([linear, angular]) - velocity)
+
+
+class GoalMaker:
+    """Makes the goal of each tick from the frame of an operator who is engaged.
+
+    Args:
+        has_person: Whether somebody wears a headset now. Hands of recordings and scripts are
+            followed as they are shown, also where they are lost.
+    """
+
+    def __init__(self, *, has_person: bool) -> None:
+        self._has_person = has_person
+        self._velocity, self._blend = GoalVelocity(), HandBlend()
+
+    def reset(self) -> None:
+        """Forget the goals so far."""
+        self._velocity.reset()
+
+    def engage(self, poses: Mapping[str, np.ndarray]) -> None:
+        """Begin an engagement of a robot whose frames are at `poses`. Shapes (7,)."""
+        self._velocity.reset()
+        self._blend.reset()
+        if self._has_person:
+            self._blend.engage(poses["head"], poses)
+
+    def make(
+        self,
+        time: float,
+        frame: OperatorFrame | None,
+        alignment: Alignment,
+        mode: Mode,
+        freed: Mapping[str, np.ndarray] | None = None,
+    ) -> Goal | None:
+        """Make a goal, None while not engaged.
+
+        Args:
+            time: The robot's clock [s].
+            frame: The operator now, None before the first frame.
+            alignment: How the operator is laid on the robot.
+            mode: Mode that is asked for.
+            freed: Poses that a constraint kept from their goals until now, None where none did:
+                hands go from there to their goals slowly. Shapes (7,).
+        """
+        if frame is None or not alignment.is_engaged:
+            return None
+        goals = alignment.goal_poses(frame)
+        if freed is not None:
+            self._blend.engage(goals["head"], freed)
+        seen = frame.tracked if self._has_person else np.ones(len(FRAMES), dtype=bool)
+        blended = self._blend.apply(time, goals, seen)
+        velocities = self._velocity.update(time, blended)
+        return Goal(blended, velocities, mode, grip_from_pinch(frame.pinch))
 
 
 def _limit(vector: np.ndarray, longest: float) -> np.ndarray:

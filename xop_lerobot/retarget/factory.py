@@ -12,12 +12,13 @@ from xop_lerobot.core.errors import BadValue
 from xop_lerobot.low_level.policy import LowLevelPolicy
 from xop_lerobot.morphology.morphology import MORPHOLOGIES, Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
-from xop_lerobot.retarget.changes import make_settings
+from xop_lerobot.retarget.changes import Settings, make_settings
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.mpc import MpcRetargeter
 from xop_lerobot.retarget.obstacles import Obstacle, load_obstacles, make_obstacles
 from xop_lerobot.retarget.plan import Retargeter
+from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.presets import build_configs
 
 logger = logging.getLogger(__name__)
@@ -70,6 +71,32 @@ def warn_of_obstacles(kind: str, morphology: Morphology, scene: str, count: int)
         _warn_once(f"{say_count(count, 'obstacle')} in scene {scene!r} ignored: {reason}.")
 
 
+def find_obstacles(morphology: Morphology, scene: str) -> tuple[Obstacle, ...] | None:
+    """Walls and furniture of a scene, None for a robot that keeps clear of nothing.
+
+    The planning model holds the floor alone, so they come from the full one.
+    """
+    if not morphology.hull_points:
+        return None
+    return make_obstacles(build_model(morphology, "full", scene=scene))
+
+
+def gather_obstacles(
+    config: RetargeterConfig,
+    morphology: Morphology,
+    scene: str,
+    obstacles: tuple[Obstacle, ...],
+) -> tuple[Obstacle, ...] | None:
+    """Add those of the file of obstacles to `obstacles`; None if the robot keeps clear of nothing.
+
+    Warns, once, where they are no part of any plan.
+    """
+    warn_of_obstacles(config.type, morphology, scene, len(obstacles))
+    if not morphology.hull_points:
+        return None
+    return obstacles + (load_obstacles(config.obstacles) if config.obstacles else ())
+
+
 @functools.cache
 def _count_obstacles(robot: str, scene: str) -> int:
     return len(make_obstacles(build_model(make_morphology(robot), "full", scene=scene)))
@@ -107,11 +134,20 @@ def make_retargeter(
     if config.obstacles:
         obstacles += load_obstacles(config.obstacles)
     retargeter = MpcRetargeter(morphology, policy, model, config, obstacles=obstacles)
-    settings = make_settings(morphology, config)
-    retargeter.configure(
-        build_configs(morphology, config, settings),
-        settings.targets,
-        settings.body,
-        settings.constraints,
-    )
+    apply_settings(retargeter, morphology, config, make_settings(morphology, config))
     return retargeter
+
+
+def apply_settings(
+    planner: Retargeter | PlanFollower,
+    morphology: Morphology,
+    config: RetargeterConfig,
+    settings: Settings,
+) -> None:
+    """Give a planner the settings that are in force, from its next solve on."""
+    planner.configure(
+        configs=build_configs(morphology, config, settings),
+        targets=settings.targets,
+        body=settings.body,
+        constraints=settings.constraints,
+    )

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadValue
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.changes import (
@@ -36,6 +37,41 @@ class AppliedChange:
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON knows it."""
         return {"source": self.source, "change": self.change.to_dict()}
+
+
+class ModeSwitch:
+    """Mode that is asked for: the last one of who asked, be it a change, a gesture or the device.
+
+    A device that states a mode in each frame, as recordings do, is heeded where it states another
+    than when it was overruled.
+
+    Args:
+        mode: Mode to begin with.
+    """
+
+    def __init__(self, mode: Mode) -> None:
+        self.mode = mode
+        self._stated: Mode | None = None
+        self._overruled: Mode | None = None
+
+    def set(self, mode: Mode) -> None:
+        """Overrule the device until it states another mode."""
+        self.mode, self._overruled = mode, self._stated
+
+    @property
+    def other(self) -> Mode:
+        """The mode that is not asked for."""
+        return Mode(1 - self.mode)
+
+    def toggle(self) -> None:
+        """Change between the two modes, as a gesture does."""
+        self.mode = self.other
+
+    def follow(self, stated: Mode | None) -> None:
+        """Take the mode that the device itself states, None if it states none."""
+        if stated is not None and stated is not self._overruled:
+            self.mode, self._overruled = stated, None
+        self._stated = stated
 
 
 class OnlineSettings:

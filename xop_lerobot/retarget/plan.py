@@ -149,6 +149,16 @@ class StampedPlan(NamedTuple):
         step = self.get_step(time)
         return {name: float(angles[step]) for name, angles in self.plan.arms.items()}
 
+    def compute_health(self, time: float) -> dict[str, float]:
+        """Figures on the plan's health at `time` for a recording, by name."""
+        return {
+            "solve_time": self.plan.timings.get("solve", 0.0),
+            "plan_age": time - self.measured,
+            "effective_samples": self.plan.effective_samples,
+            "status": float(self.plan.status),
+            **self.plan.health,
+        }
+
     def predict_velocity(self, time: float) -> np.ndarray | None:
         """Predicted linear velocity of the base at `time`, world axes [m/s].
 

@@ -61,6 +61,11 @@ class Synced:
     correction: float = 0.0
     rotation: float = 0.0
 
+    @property
+    def health(self) -> dict[str, float]:
+        """Figures for a recording, by name."""
+        return {"sync_residual": self.residual, "sync_status": float(self.status)}
+
 
 class StateSync:
     r"""Solves Eq. 4 each tick: the state the planner's simulator starts from.
