@@ -76,7 +76,7 @@ CONFIGS = {
         # Shorter ones do not see a torso collapse when the base turns at speed.
         horizon=14,
         noise_std={"v": 0.2, "yaw_rate": 0.3, **TORSO_NOISE},
-        weights=CostWeights(orientation=0.1, tilt_share=2.0, lean=50.0, lateral=0.4),
+        weights=CostWeights(orientation=0.1, tilt_share=2.0, lean=500.0, lateral=0.4),
         reach=0.4,
     ),
 }
