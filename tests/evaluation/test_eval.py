@@ -11,7 +11,7 @@ from eval_jobs import do, make_trial, run_made
 from xop_lerobot.core.errors import BadValue, UnknownName
 from xop_lerobot.core.pool import THREAD_VARIABLES, run_jobs
 from xop_lerobot.evaluation import study
-from xop_lerobot.evaluation.cli import main
+from xop_lerobot.evaluation.cli import main, parse_arguments
 from xop_lerobot.evaluation.methods import (
     METHODS,
     make_retargeter_config,
@@ -291,3 +291,8 @@ def _repository():
     from pathlib import Path
 
     return Path(__file__).parents[2]
+
+
+def test_lerobots_type_of_a_robot_names_it_too():
+    arguments = ["--robot", "xop_rby1m", "--task", "dual_point_touch"]
+    assert parse_arguments(arguments).robot == "rby1m"

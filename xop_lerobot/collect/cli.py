@@ -24,7 +24,7 @@ from xop_lerobot.collect.run import WorkerFailed, run_collection
 from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, make_output_readable
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.shutdown import stop_on_sigterm
-from xop_lerobot.morphology.morphology import say_robots
+from xop_lerobot.morphology.morphology import read_robot, say_robots
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def make_parser() -> CommandParser:
     """Make the parser of the command line."""
     parser = CommandParser("xop-collect", __doc__)
     add = parser.add_argument
-    add("--robot", required=True, help=f"robot: {say_robots()}")
+    add("--robot", required=True, type=read_robot, help=f"robot: {say_robots()}")
     add(
         "--task",
         required=True,

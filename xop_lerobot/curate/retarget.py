@@ -40,7 +40,7 @@ from xop_lerobot.curate.retarget_job import (
     read_weights,
 )
 from xop_lerobot.curate.source import EpisodeEntry, Source
-from xop_lerobot.morphology.morphology import say_robots
+from xop_lerobot.morphology.morphology import read_robot, say_robots
 from xop_lerobot.recording.facts import FACTS_DIR
 
 SUMMARY = "replay the operators with another robot, retargeter or policy"
@@ -76,7 +76,7 @@ def add_arguments(parser: CommandParser) -> None:
         help="directory of the new dataset; the source stays as it is",
     )
     add("--dry-run", action="store_true", help="say what would be replayed, and do nothing")
-    add("--robot", required=True, help=f"robot: {say_robots()}")
+    add("--robot", required=True, type=read_robot, help=f"robot: {say_robots()}")
     add(
         "--episodes",
         type=parse_episodes,

@@ -43,7 +43,7 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.evaluation.bench_report import KEYS, describe_machine, summarise
 from xop_lerobot.evaluation.trial import closed_loop
 from xop_lerobot.low_level.policy import POLICY_DT
-from xop_lerobot.morphology.morphology import make_morphology, say_robots
+from xop_lerobot.morphology.morphology import make_morphology, read_robot, say_robots
 from xop_lerobot.operator.goal import GoalVelocity
 from xop_lerobot.plant.config import NOISE_PRESETS, SimulationConfig
 from xop_lerobot.plant.policy_loop import PolicyLoop
@@ -327,7 +327,7 @@ def make_parser() -> CommandParser:
     parser = CommandParser("xop-bench", __doc__)
     add = parser.add_argument
     defaults = {each.name: each.default for each in dataclasses.fields(BenchConfig)}
-    add("--robot", required=True, help=say_robots())
+    add("--robot", required=True, type=read_robot, help=say_robots())
     add("--mode", required=True, help="stationary or mobile")
     add("--samples", type=int, default=0, help="rollouts per solve; 0: the preset's (default: 0)")
     add("--horizon", type=int, default=0,

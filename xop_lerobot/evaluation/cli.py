@@ -27,7 +27,7 @@ from xop_lerobot.core.command_line import (
     split_pair,
 )
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
-from xop_lerobot.morphology.morphology import say_robots
+from xop_lerobot.morphology.morphology import read_robot, say_robots
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ def make_parser() -> CommandParser:
     add = parser.add_argument
     add("--config", type=Path, help="YAML file of a whole study; --robot, --task, --methods, "
         "--variant and --low-level then choose from it (default: none)")  # fmt: skip
-    add("--robot", help=say_robots())
+    add("--robot", type=read_robot, help=say_robots())
     add("--task", help="dual_point_touch, box_pick_and_place or non_prehensile_transport")
     add("--methods", help="methods, comma-separated: mpc, mpc_no_sync, mpc_table1, direct, "
         "direct_amo (default: mpc,direct)")  # fmt: skip

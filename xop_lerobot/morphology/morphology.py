@@ -281,6 +281,11 @@ def _say_choices(names: Sequence[str]) -> str:
     return f"{', '.join(names[:-1])} or {names[-1]}"
 
 
+def read_robot(name: str) -> str:
+    """A robot's name, as command lines take it: LeRobot's type of it, ``"xop_g1"``, will do too."""
+    return name.removeprefix("xop_")
+
+
 def make_morphology(name: str) -> Morphology:
     """Make the robot `name`.
 
