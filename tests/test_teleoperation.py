@@ -212,7 +212,8 @@ def test_it_does_not_engage_while_the_robot_moves_or_lies(rig, name):
 
 @pytest.mark.slow
 @robots
-def test_a_lost_head_stops_the_robot_and_the_next_engagement_aligns_anew(rig, name):
+def test_a_lost_head_stops_the_robot_and_the_next_engagement_aligns_anew(rig, name, caplog):
+    caplog.set_level("INFO")
     r = rig(name, mode="mobile")
     start = r.loop.state.time
     r.person.motion = lambda t: make_frame(t, (0.5 * (t - start), 0, 1.7))
@@ -224,6 +225,8 @@ def test_a_lost_head_stops_the_robot_and_the_next_engagement_aligns_anew(rig, na
     stopping = r.run(1.6)
     action, record = stopping[-1]
     assert not record.engaged
+    lost = "Disengaged: the headset has lost its position, or sends nothing."
+    assert caplog.messages.count(f"{lost} The robot holds until that is over.") == 1
     assert action.mode is Mode.STATIONARY
     np.testing.assert_array_equal(action.command[r.morphology.command_space.mobile_only], 0)
     arms = stopping[0][0].arms

@@ -245,7 +245,13 @@ class Engagement:
             return frame
         is_over = state.fallen or bool(state.trouble) or self.device.is_paused(state.time)
         if self.is_engaged:
-            if frame is None or is_lost(frame) or is_over:
+            if frame is None or is_lost(frame):
+                self.disengage()
+                reason = self.device.trouble or UNSEEN
+                self._board.tell(
+                    Cue.DISENGAGED, f"Disengaged: {reason}. The robot holds until that is over."
+                )
+            elif is_over:
                 self.disengage()
             return frame
         if not state.settled or is_over:
