@@ -153,7 +153,7 @@ def test_other_commands(monkeypatch):
     from xop_lerobot.collect import cli as collect
     from xop_lerobot.control import client
     from xop_lerobot.doctor import cli as doctor
-    from xop_lerobot.doctor.checks import Finding, Level
+    from xop_lerobot.doctor.finding import Finding, Level
     from xop_lerobot.evaluation import bench, cli
 
     for command in (collect, bench, cli, doctor, client):

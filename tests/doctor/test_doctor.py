@@ -24,20 +24,14 @@ from webxr_client import Page
 from xop_lerobot.core.transforms import make_pose, quat_exp
 from xop_lerobot.doctor import checks, cli
 from xop_lerobot.doctor.checks import (
-    Answer,
-    Finding,
-    Level,
-    Setup,
-    check_certificate,
     check_disk,
     check_gl,
-    check_headset,
     check_interpreter,
     check_plugin,
-    check_ports,
     find_faults,
-    run_child,
 )
+from xop_lerobot.doctor.finding import Answer, Finding, Level, Setup, run_child
+from xop_lerobot.doctor.headset import check_certificate, check_headset, check_ports
 from xop_lerobot.operator.devices.webxr import WebXrDevice
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.webxr.certificate import get_certificate

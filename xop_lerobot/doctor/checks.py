@@ -1,120 +1,23 @@
-"""Checks of `xop-doctor`: each returns a finding with advice.
+"""Checks of `xop-doctor` on this machine and what is installed; each returns a finding with advice.
 
 What may crash or hang (a driver, a plugin) runs in a Python of its own.
 """
 
 from __future__ import annotations
 
-import datetime
 import importlib.metadata
 import json
 import os
 import platform
 import shutil
-import socket
-import subprocess
 import sys
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from enum import Enum
-from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from xop_lerobot.doctor.finding import Finding, Level, Setup, run_child
 from xop_lerobot.morphology.morphology import MORPHOLOGIES
 from xop_lerobot.plant.rendering import choose_backends
-
-
-class Answer(NamedTuple):
-    """Result of a child process."""
-
-    ok: bool
-    """Whether it has ended well."""
-    text: str
-    """What it has printed, or the last line of why not."""
-
-
-def run_child(code: str, *arguments: str, timeout: float = 120.0) -> Answer:
-    """Run `code` with `arguments` in `sys.argv[1:]`.
-
-    Args:
-        code: The program.
-        arguments: What it is given.
-        timeout: It is ended after so long [s].
-    """
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", code, *arguments],
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return Answer(False, f"no answer within {timeout:g} s")
-    if done.returncode == 0:
-        return Answer(True, done.stdout.strip())
-    lines = done.stderr.strip().splitlines()
-    return Answer(False, lines[-1] if lines else f"it ended with status {done.returncode}")
-
-
-class Level(Enum):
-    """Severity of a finding."""
-
-    OK = "ok"
-    WARN = "warn"
-    """It works, with a warning."""
-    FAIL = "fail"
-    """It does not work."""
-    SKIP = "skip"
-    """Not requested, or not decidable."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Result of a check.
-
-    Attributes:
-        level: How well it is.
-        text: What was found, in a sentence.
-        advice: What to do about it; empty where there is nothing to do.
-        figures: The same in numbers, fit for JSON.
-    """
-
-    level: Level
-    text: str
-    advice: str = ""
-    figures: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-
-
-@dataclass(frozen=True)
-class Setup:
-    """Intended use of this machine.
-
-    Attributes:
-        device: The headset, `avp` or `webxr`; empty for none.
-        host: `avp`: its address. `webxr`: address to listen at; empty is loopback.
-        port: Its port, 0 for the usual one.
-        seconds: How long its stream is measured [s].
-        wait: How long it is waited for [s].
-        robot: Robot whose planner is timed.
-        mode: In which mode.
-        root: Where datasets are written.
-    """
-
-    device: str = ""
-    host: str = ""
-    port: int = 0
-    seconds: float = 3.0
-    wait: float = 60.0
-    robot: str = MORPHOLOGIES.built_in[0]
-    mode: str = "stationary"
-    root: Path = Path()
-
 
 _CODE = """
 import time
@@ -207,37 +110,6 @@ def check_disk(setup: Setup) -> Finding:
     return Finding(Level.OK, text, "", figures)
 
 
-def check_certificate(setup: Setup) -> Finding:
-    """Check the certificate without changing it."""
-    if setup.device == "avp":
-        return Finding(Level.SKIP, "a Vision Pro with Tracking Streamer needs none")
-    if setup.host in ("", "127.0.0.1", "localhost", "::1"):
-        return Finding(Level.SKIP, "on loopback the page needs none")
-    from xop_lerobot.operator.webxr.certificate import (  # noqa: PLC0415  brings cryptography
-        find_folder,
-        inspect_certificate,
-        list_own_names,
-    )
-
-    folder, now = find_folder(), datetime.datetime.now(datetime.UTC)
-    found, fault = inspect_certificate(folder, list_own_names(), now)
-    if found is not None:
-        days = (found.end - now).days
-        return Finding(
-            Level.OK,
-            f"the certificate in {folder} is valid for {days} days and all addresses of this "
-            "machine; only its user can read the key",
-            "",
-            {"days": days, "fingerprint": found.fingerprint},
-        )
-    exists = (folder / "webxr.crt").exists()
-    return Finding(
-        Level.WARN if exists else Level.OK,
-        f"the certificate in {folder}: {fault}; the next session makes one",
-        "headsets will ask again whether to trust it" if exists else "",
-    )
-
-
 STEPS, WARMUP = 40, 10
 SHARE = 0.8
 """A planner that needs more of its period leaves too little to the rest."""
@@ -283,53 +155,6 @@ def check_cpu(setup: Setup) -> Finding:
             kept,
         )
     return Finding(Level.OK, text, "", kept)
-
-
-TIMEOUT_S = 3.0
-
-
-def check_ports(setup: Setup) -> Finding:
-    """Listen on the page's port, or connect to that of a Vision Pro."""
-    # Where the protocols are not installed, this check fails alone.
-    from xop_lerobot.operator.devices import avp as avp_protocol  # noqa: PLC0415
-    from xop_lerobot.operator.webxr import protocol as webxr_protocol  # noqa: PLC0415
-
-    if setup.device == "avp":
-        return _knock(setup.host, setup.port or avp_protocol.PORT)
-    host = setup.host or "127.0.0.1"
-    return _listen(host, setup.port or webxr_protocol.PORT)
-
-
-def _listen(host: str, port: int) -> Finding:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-            probe.listen(1)
-    except OSError as error:
-        return Finding(
-            Level.FAIL,
-            f"port {port} at {host} cannot be opened: {error.strerror or error}",
-            "end the other program (another session of ours?), or choose another port with "
-            "--teleop.device.port; the address must be one of this machine's",
-        )
-    return Finding(Level.OK, f"port {port} at {host} is free for the page of a headset")
-
-
-def _knock(host: str, port: int) -> Finding:
-    if not host:
-        return Finding(Level.FAIL, "no address of a Vision Pro", "pass --host ADDRESS")
-    try:
-        with socket.create_connection((host, port), timeout=TIMEOUT_S):
-            return Finding(Level.OK, f"{host} answers at port {port}")
-    except OSError as error:
-        return Finding(
-            Level.FAIL,
-            f"{host} does not answer at port {port}: {error.strerror or error}",
-            "open Tracking Streamer in the headset and press Start; both must be in one network, "
-            "without a firewall or client isolation of the access point between them",
-        )
 
 
 DISTRIBUTION = "lerobot_teleoperator_xop"
@@ -378,99 +203,6 @@ def find_faults(requirements: list[str]) -> list[str]:
         if not requirement.specifier.contains(version, prereleases=True):
             faults.append(f"{requirement.name} is {version}, and {requirement.specifier} is needed")
     return faults
-
-
-GOOD_HZ, LEAST_HZ = 50.0, 25.0
-SLOW_S = 0.1
-"""Who drives with a delay of more than this feels it [s]."""
-
-
-def check_headset(setup: Setup) -> Finding:
-    """Connect, and measure the stream; for a page, wait until it is opened."""
-    if not setup.device:
-        return Finding(
-            Level.SKIP, "no headset was named", "pass --device avp --host ADDRESS, or webxr"
-        )
-    from xop_lerobot.operator.devices import DeviceConfig, make_device  # noqa: PLC0415
-    from xop_lerobot.operator.devices.live import LiveDevice  # noqa: PLC0415
-
-    config = DeviceConfig(type=setup.device, host=setup.host or None, port=setup.port)
-    device = make_device(config)
-    assert isinstance(device, LiveDevice)
-    device.connect()
-    try:
-        end = time.monotonic() + setup.wait
-        while device.read(0.0) is None and time.monotonic() < end:
-            time.sleep(0.05)
-        if device.read(0.0) is None:
-            return Finding(
-                Level.FAIL,
-                f"{device.address}: no pose has come within {setup.wait:g} s"
-                + (f" ({device.trouble})" if device.trouble else ""),
-                "update xop-lerobot, or use a version of the app that this one speaks to"
-                if "empty" in device.status.counts
-                else "put the headset on, and open its app or the page's address",
-                {"counts": device.status.counts},
-            )
-        return _measure(device, setup.seconds)
-    finally:
-        device.disconnect()
-
-
-def _measure(device, seconds: float) -> Finding:  # noqa: ANN001  a LiveDevice, which is not loaded
-    before = device.status.counts
-    seen, ticks, ages = [0, 0, 0], 0, []
-    begin = time.monotonic()
-    while time.monotonic() < begin + seconds:
-        frame = device.read(0.0)
-        seen = [n + int(flag) for n, flag in zip(seen, frame.tracked, strict=True)]
-        ages.append(device.status.age)
-        ticks += 1
-        time.sleep(0.02)
-    status = device.status
-    counts = {name: n - before.get(name, 0) for name, n in status.counts.items()}
-    rate = counts.get("taken", 0) / (time.monotonic() - begin)
-    shares = [round(n / ticks, 3) for n in seen]
-    delay = None if status.delay is None else round(status.delay * 1e3, 1)
-    gap = max(ages)
-    figures = {
-        "rate_hz": round(rate, 1),
-        "delay_ms": delay,
-        "longest_gap_ms": round(gap * 1e3, 1),
-        "seen": dict(zip(("head", "left", "right"), shares, strict=True)),
-        "hand_rates_hz": dict(zip(("left", "right"), status.hand_rates, strict=True)),
-        "counts": {name: n for name, n in counts.items() if n},
-    }
-    late = "unknown" if delay is None else f"{delay:.0f} ms"
-    text = (
-        f"{device.address}: {rate:.0f} poses a second, delay {late}, longest gap "
-        f"{gap * 1e3:.0f} ms; head, left and right hand seen for "
-        f"{', '.join(f'{share:.0%}' for share in shares)} of the time"
-    )
-    if rate < LEAST_HZ or gap > device.config.stale_s:
-        return Finding(
-            Level.FAIL,
-            text,
-            "the robot would be disengaged repeatedly: come nearer to the access point, use "
-            "5 GHz or a cable, and close other programs",
-            figures,
-        )
-    if status.slow_hands:
-        return Finding(
-            Level.FAIL,
-            f"{text}. {status.trouble}",
-            "hold both hands in front of you, in good light, and close other apps of the headset: "
-            "hands with so few poses cannot engage",
-            figures,
-        )
-    if rate < GOOD_HZ or (status.delay or 0) > SLOW_S or min(shares) < 0.9:
-        return Finding(
-            Level.WARN,
-            text,
-            "hold both hands in front of you, in good light; a better network shortens the delay",
-            figures,
-        )
-    return Finding(Level.OK, text, "", figures)
 
 
 WANTED = {

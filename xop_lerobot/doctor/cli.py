@@ -20,18 +20,14 @@ from pathlib import Path
 from xop_lerobot.core.command_line import CommandParser, make_output_readable
 from xop_lerobot.core.errors import BadValue, UnknownName, XopError
 from xop_lerobot.doctor.checks import (
-    Finding,
-    Level,
-    Setup,
-    check_certificate,
     check_cpu,
     check_disk,
     check_gl,
-    check_headset,
     check_interpreter,
     check_plugin,
-    check_ports,
 )
+from xop_lerobot.doctor.finding import Finding, Level, Setup
+from xop_lerobot.doctor.headset import check_certificate, check_headset, check_ports
 
 CHECKS: dict[str, Callable[[Setup], Finding]] = {
     "interpreter": check_interpreter,
