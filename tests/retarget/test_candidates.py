@@ -74,13 +74,13 @@ class Bench:
         planner.sample, planner.update = watched_sample, watched_update
 
     def _watch_evaluations(self) -> None:
-        evaluate = self.retargeter.problem._evaluate
+        evaluate = self.retargeter.problem.evaluate
 
         def watched(*args):
             self.evaluations.append(evaluate(*args))
             return self.evaluations[-1]
 
-        self.retargeter.problem._evaluate = watched  # type: ignore[method-assign]
+        self.retargeter.problem.evaluate = watched  # type: ignore[method-assign]
 
     def make_goal(self, mode: Mode, offset=(0.25, 0.05, -0.05)) -> Goal:
         pose = self.head.copy()

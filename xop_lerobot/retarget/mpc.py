@@ -237,7 +237,9 @@ class MpcRetargeter(Retargeter):
         # What they do and what that costs: Eqs. 1b, 1c and 1a.
         prediction = self.problem.predict(state, now, commands, mode)
         rolled = perf_counter()
-        scores = self.problem.score(prediction, commands, now, reference, proposal, mode, config)
+        scores = self.problem.score(
+            self.problem.evaluate(prediction, commands, now, reference, proposal, mode, config)
+        )
         weights = optimizer.update(samples, scores.costs)  # which adds the samples' own penalty
 
         # The mean is executed unless it is likely to fail.

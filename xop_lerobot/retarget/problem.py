@@ -135,7 +135,7 @@ class Problem:
         )
         return prediction._replace(commands=limited)
 
-    def score(
+    def evaluate(
         self,
         prediction: Prediction,
         decisions: np.ndarray,
@@ -144,8 +144,8 @@ class Problem:
         proposal: np.ndarray,
         mode: Mode,
         config: MpcConfig,
-    ) -> Scores:
-        """Compute what predictions cost.
+    ) -> Evaluation:
+        """Gather all that the cost terms are computed from.
 
         Args:
             prediction: The predictions of `decisions`.
@@ -156,26 +156,6 @@ class Problem:
             mode: Mode of the robot.
             config: Parameters of the mode.
         """
-        with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
-            evaluation = self._evaluate(
-                prediction, decisions, now, reference, proposal, mode, config
-            )
-            terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
-        costs = np.sum(list(terms.values()), axis=0)
-        falls = self._fall.find_falls(evaluation) | ~np.isfinite(costs)
-        return Scores(terms, costs, falls, self._collision.find_touches(evaluation))
-
-    def _evaluate(
-        self,
-        prediction: Prediction,
-        decisions: np.ndarray,
-        now: PlannerState,
-        reference: Reference,
-        proposal: np.ndarray,
-        mode: Mode,
-        config: MpcConfig,
-    ) -> Evaluation:
-        """All that the cost terms are computed from."""
         model, executed = self.command_model, now.executed
         origins = {
             "proposal": proposal,
@@ -190,7 +170,8 @@ class Problem:
             offset=now.offset,
             settled=model.settle(now.settled, decisions[:, -1], config.horizon * POLICY_DT),
         )
-        extrapolated = model.extrapolate(end, decisions[:, -1], config.extrapolation_s, mode)
+        with np.errstate(invalid="ignore"):  # a diverged sample is NaN
+            extrapolated = model.extrapolate(end, decisions[:, -1], config.extrapolation_s, mode)
         frames = self.morphology.frames
         sites = {name: frames[name] for name in reference.goals}
         read = self.readings.read(prediction.sensordata, sites)
@@ -220,3 +201,11 @@ class Problem:
             drives=bool((decided & model.is_velocity()).any()),
             balance=reference.balance,
         )
+
+    def score(self, evaluation: Evaluation) -> Scores:
+        """Compute what predictions cost."""
+        with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
+            terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
+        costs = np.sum(list(terms.values()), axis=0)
+        falls = self._fall.find_falls(evaluation) | ~np.isfinite(costs)
+        return Scores(terms, costs, falls, self._collision.find_touches(evaluation))
