@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from xop_lerobot.core.transforms import (
+    compute_heading,
+    make_pose,
+    quat_exp,
+    quat_from_yaw,
+    quat_multiply,
+    quat_rotate,
+)
+from xop_lerobot.operator.frame import OperatorFrame
 
 SWAY_BAND = (0.1, 1.0)
 """Band of postural sway [Hz]."""
@@ -98,4 +108,20 @@ class HumanNoise:
             head_turn=self.scale * self._head_turn.at(time),
             wrists=self.scale * np.array(wrists),
             wrist_turns=self.scale * np.array(turns),
+        )
+
+    def disturb(self, frame: OperatorFrame) -> OperatorFrame:
+        """The frame of a person who sways and trembles at its time."""
+        sway = self.at(frame.time)
+        turn = quat_from_yaw(compute_heading(frame.head[3:]))
+
+        def move(pose: np.ndarray, offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+            quat = quat_multiply(pose[3:], quat_exp(rotation))
+            return make_pose(pose[:3] + quat_rotate(turn, offset), quat)
+
+        return replace(
+            frame,
+            head=move(frame.head, sway.head, sway.head_turn),
+            left_wrist=move(frame.left_wrist, sway.wrists[0], sway.wrist_turns[0]),
+            right_wrist=move(frame.right_wrist, sway.wrists[1], sway.wrist_turns[1]),
         )

@@ -2,17 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from xop_lerobot.core.errors import NotConnected
-from xop_lerobot.core.transforms import (
-    compute_heading,
-    make_pose,
-    quat_exp,
-    quat_from_yaw,
-    quat_multiply,
-    quat_rotate,
-)
+from xop_lerobot.core.transforms import level_pose, pose_multiply
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.replay import Player
 from xop_lerobot.operator.frame import OperatorFrame
@@ -61,27 +52,19 @@ class ScriptedDevice(Player):
     def frame_at(self, stamp: float) -> OperatorFrame:
         """Frame at `stamp` [s] of the script's clock; the sway continues after its end."""
         script = self.script
-        sway = self._noise.at(stamp)
         head = script.tracks["head"].at(stamp)
-        turn = quat_from_yaw(compute_heading(head[3:]))
-
-        def disturb(pose: np.ndarray, offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-            quat = quat_multiply(pose[3:], quat_exp(rotation))
-            return make_pose(pose[:3] + quat_rotate(turn, offset), quat)
-
-        wrists = []
-        for side, name in enumerate(("left_wrist", "right_wrist")):
-            pose = script.tracks[name].at(stamp)
-            if script.wrists_in_body:
-                position = head[:3] + quat_rotate(turn, pose[:3])
-                pose = make_pose(position, quat_multiply(turn, pose[3:]))
-            wrists.append(disturb(pose, sway.wrists[side], sway.wrist_turns[side]))
+        wrists = [script.tracks[name].at(stamp) for name in ("left_wrist", "right_wrist")]
+        if script.wrists_in_body:
+            body = level_pose(head)
+            wrists = [pose_multiply(body, wrist) for wrist in wrists]
         mode = script.mode_at(stamp)
-        return OperatorFrame(
-            stamp,
-            disturb(head, sway.head, sway.head_turn),
-            *wrists,
-            pinch=script.pinch_at(stamp),
-            # A script that states modes states them from the beginning.
-            mode=self.start_mode if mode is None and script.modes else mode,
+        return self._noise.disturb(
+            OperatorFrame(
+                stamp,
+                head,
+                *wrists,
+                pinch=script.pinch_at(stamp),
+                # A script that states modes states them from the beginning.
+                mode=self.start_mode if mode is None and script.modes else mode,
+            )
         )
