@@ -165,8 +165,37 @@ def test_single_precision_of_the_action_does_not_upset_it():
         smoother.note(action.command, after.command)
         steps.append(after.command - action.command)
         action = after
-    np.testing.assert_allclose(steps[0], np.minimum(space.max_accel * 0.04**2, steps[1]), rtol=1e-5)
-    np.testing.assert_allclose(steps[-1], space.max_rate * 0.04, rtol=1e-4)
+    first = np.minimum(space.max_accel * 0.04**2, steps[1])
+    np.testing.assert_allclose(steps[0], first, rtol=0.01)
+    # Velocities change at their own rates, the posture as fast as its slowest joint allows.
+    velocities = space.mobile_only
+    np.testing.assert_allclose(steps[-1][velocities], space.max_rate[velocities] * 0.04, rtol=1e-4)
+    share = steps[-1] / (space.max_rate * 0.04)
+    assert share[~velocities].max() == pytest.approx(1.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["g1", "rby1"])
+def test_a_posture_changes_along_a_straight_line(name):
+    """Quick joints do not run ahead of slow ones, and no joint is faster than its rate."""
+    space = make_morphology(name).command_space
+    smoother, executed = CommandSmoother(space, 0.04), space.neutral
+    posture = ~space.mobile_only
+    wanted = np.where(posture, 0.7 * space.high + 0.3 * space.low, 0.0)
+    path = [executed]
+    for _ in range(200):
+        sent, _ = smoother.smooth(wanted, Mode.STATIONARY, executed, Mode.STATIONARY)
+        smoother.note(executed, sent)
+        executed = sent
+        path.append(executed)
+    start, way = space.neutral[posture], (wanted - space.neutral)[posture]
+    rows = np.array(path)[:, posture] - start
+    shares = rows @ way / (way @ way)
+    assert shares[-1] == pytest.approx(1.0)
+    assert (np.diff(shares) >= -1e-9).all()
+    off = np.abs(rows - shares[:, None] * way)
+    assert off.max() < 0.03 * np.abs(way).max()  # as it sets off, by the limits of acceleration
+    steps = np.abs(np.diff(rows, axis=0)) / (space.max_rate[posture] * 0.04)
+    assert steps.max() == pytest.approx(1.0, rel=1e-6)
 
 
 def test_mistakes():

@@ -274,6 +274,27 @@ class CommandSpace:
         low, high = self.bounds(mode)
         return np.clip(np.where(stops, self.neutral, command), low, high)
 
+    def straighten(self, step: np.ndarray, missing: np.ndarray) -> np.ndarray:
+        r"""Shorten steps so that a posture changes along a straight line.
+
+        All entries but velocities move by one share of what they miss,
+        :math:`s = \min_i |\delta_i| / |\Delta_i|`, and so arrive together. With each at its own
+        rate, quick joints of a chain run ahead of slow ones: between two postures that have the
+        head in the same place it would go a long way round.
+
+        Args:
+            step: Steps :math:`\delta` within the rate limits, towards what is missing. (..., k).
+            missing: Distance :math:`\Delta` to what is wanted. Shape (..., k).
+
+        Returns:
+            The steps, none of them longer. Shape (..., k).
+        """
+        size, distance = np.abs(step), np.abs(missing)
+        counts = ~self.mobile_only & (distance > 1e-12)
+        shares = np.divide(size, distance, out=np.ones_like(size), where=counts)
+        share = shares.min(axis=-1, keepdims=True, initial=1.0)
+        return np.where(self.mobile_only, step, share * missing)
+
     def index(self, name: str) -> int:
         """Return the position of `name`.
 

@@ -50,7 +50,7 @@ def _make_conservative(
     stay near the plan.
     """
     del morphology, paper
-    weights = dataclasses.replace(config.weights, control=0.5, change=0.2)
+    weights = dataclasses.replace(config.weights, control=2.0, change=0.5)
     return _hurry(dataclasses.replace(config, weights=weights), time=2.0, noise=0.5)
 
 

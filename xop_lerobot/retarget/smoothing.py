@@ -67,6 +67,7 @@ class CommandSmoother:
         step = np.sign(step) * np.minimum(
             np.abs(step), compute_braking_step(np.abs(wanted - executed), self._gain)
         )
+        step = space.straighten(step, wanted - executed)
         step = np.clip(step, self._step - self._gain, self._step + self._gain)
         # What still moves towards a bound must be able to stop there.
         low, high = space.bounds(mode)

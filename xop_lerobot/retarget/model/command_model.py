@@ -211,13 +211,18 @@ class CommandModel:
         step = self.space.compute_max_rate(mode, executed) * dt
         horizon = commands.shape[1]
         if (commands == commands[:, :1]).all():  # a command that is held is approached straight
-            reach = step * np.arange(1, horizon + 1)[:, None]
-            return np.clip(commands, executed - reach, executed + reach)
+            return self._approach(executed, commands, step * np.arange(1, horizon + 1)[:, None])
         limited = np.empty_like(commands)
         for k in range(horizon):
-            executed = np.clip(commands[:, k], executed - step, executed + step)
-            limited[:, k] = executed
+            executed = limited[:, k] = self._approach(executed, commands[:, k], step)
         return limited
+
+    def _approach(
+        self, executed: np.ndarray, commands: np.ndarray, reach: np.ndarray
+    ) -> np.ndarray:
+        """Go towards commands by at most `reach`, as `CommandSmoother` does. Shapes (..., k)."""
+        missing = commands - executed
+        return executed + self.space.straighten(np.clip(missing, -reach, reach), missing)
 
     def find_lowest_height(self) -> float:
         """Lowest base height that can be commanded [m]; infinite where it can't be."""
