@@ -87,6 +87,52 @@ def read_timelines(path: Path) -> list[dict]:
 
 # In a browser.
 
+AREA = """(place) => {
+    const view = [...Bokeh.index].find((each) => each.model.id === place.figure);
+    const { left, top } = view.el.getBoundingClientRect();
+    return [left + view.frame.x_scale.compute(place.x), top + view.frame.y_scale.compute(place.y)];
+}"""
+"""Where a point of a figure is on the screen."""
+FIGURES_OF = """(sheet) => sheet.document.roots().map((figure) => {
+    const view = [...Bokeh.index].find((each) => each.model === figure);
+    const { width, height } = view.bbox;
+    const axes = view.axis_views.map(({ bbox, model }) => ({ label: model.axis_label,
+        inside: bbox.left >= 0 && bbox.top >= 0 && bbox.right <= width && bbox.bottom <= height }));
+    return { id: figure.id, axes, frame: view.frame.bbox.width / width };
+})"""
+
+
+def show(page, view: str) -> None:
+    page.locator(f'#views button[data-view="{view}"]').click()
+
+
+def open_timelines(page, index: int):
+    """Open an episode's timelines and scroll over all of its figures."""
+    section = page.locator(f"#episode-{index}")
+    section.locator(".timelines").evaluate("each => { each.open = true; }")
+    hosts = section.locator(".bands, .panel > div:last-child")
+    for place in range(hosts.count()):
+        hosts.nth(place).scroll_into_view_if_needed()
+        hosts.nth(place).locator(".bk-Figure").wait_for()
+    return section
+
+
+def open_plots(page) -> list[dict]:
+    """Show the plots, and scroll over all of them."""
+    show(page, "plots")
+    hosts = page.locator("[data-plot]")
+    for place in range(hosts.count()):
+        hosts.nth(place).scroll_into_view_if_needed()
+        hosts.nth(place).locator(".bk-Figure").wait_for()
+    return page.evaluate(f"({FIGURES_OF})(plots)")
+
+
+def locate(page, host, x: float, y: float) -> tuple[float, float]:
+    """Where a point of the figure in `host` is on the screen, once it is in view."""
+    host.scroll_into_view_if_needed()
+    figure = host.evaluate("host => [...Bokeh.index].find((v) => host.contains(v.el)).model.id")
+    return page.evaluate(AREA, {"figure": figure, "x": x, "y": y})
+
 
 def read_column(page, name: str) -> list[str]:
     places = page.locator("#table th").evaluate_all("cells => cells.map((c) => c.dataset.name)")
@@ -94,17 +140,23 @@ def read_column(page, name: str) -> list[str]:
     return cells.all_inner_texts()
 
 
+def read_list(page) -> list[str]:
+    """The episodes whose sections are shown, in their order."""
+    return page.locator(".episode:visible").evaluate_all("all => all.map((e) => e.dataset.episode)")
+
+
 @pytest.mark.slow
 def test_the_page_runs_and_fetches_nothing(page, page_file):
     assert page.title() == "Dataset data"
-    page.locator("#episode-5").scroll_into_view_if_needed()
-    page.wait_for_selector("#episode-5 canvas")
+    open_timelines(page, 5)
+    open_plots(page)
     assert page.problems == []
     assert page.requests == [page_file.as_uri()]
 
 
 @pytest.mark.slow
-def test_the_table_sorts_by_any_figure(page, page_file):
+def test_table_and_list_sort_by_any_figure(page, page_file):
+    show(page, "table")
     assert read_column(page, "episode") == [str(index) for index in range(EPISODES)]
     data = read_figures(page_file)
     place = list(FIGURES).index("tracking_p95")
@@ -117,6 +169,9 @@ def test_the_table_sorts_by_any_figure(page, page_file):
     head.locator("button").click()
     assert read_column(page, "episode") == ranked[::-1]
     assert head.get_attribute("aria-sort") == "descending"
+    show(page, "episodes")
+    assert read_list(page) == ranked[::-1]
+    show(page, "table")
     # One that is not among the columns gets there by being chosen; what is unknown comes last.
     for figure in FIGURES:
         page.select_option("#sort", figure)
@@ -128,68 +183,153 @@ def test_the_table_sorts_by_any_figure(page, page_file):
 
 
 def test_the_table_leads_to_episodes_and_back(page):
+    show(page, "table")
     page.locator("#table tbody a", has_text="4").click()
     section = page.locator("#episode-4")
-    page.wait_for_function("document.querySelector('#episode-4').getBoundingClientRect().top < 200")
+    page.wait_for_function(
+        "() => document.querySelector('#episode-4').getBoundingClientRect().top < 200"
+    )
     assert section.locator("h3").inner_text().startswith("Episode 4")
-    section.locator("a.up").click()
-    page.wait_for_function("document.querySelector('#episodes').getBoundingClientRect().top >= -1")
-    assert page.url.endswith("#episodes")
+    section.locator(".bk-Figure").first.wait_for()
+    show(page, "table")
+    assert page.locator("#table").is_visible()
+    assert not section.is_visible()
 
 
-def test_the_table_shows_a_choice(page, page_file):
+def test_table_and_list_show_a_choice(page, page_file):
     place = list(FIGURES).index("success")
     failed = [row[0][0] for row in read_figures(page_file)["rows"] if row[0][place] is False]
     page.select_option("#choice", "no success")
+    assert read_list(page) == list(map(str, failed))
+    show(page, "table")
     assert read_column(page, "episode") == list(map(str, failed))
     assert page.inner_text("#count") == f"{len(failed)} of {EPISODES} episodes"
 
 
-def test_plots_have_a_point_an_episode_and_lead_there(page):
-    plots = page.locator("#plots svg")
-    assert plots.count() >= 8
-    for index in range(plots.count()):
-        assert plots.nth(index).locator("circle").count() == EPISODES
-        assert plots.nth(index).locator("rect.bar").count() == 20
-    plots.first.locator('circle[data-episode="2"]').click()
-    assert page.url.endswith("#episode-2")
+@pytest.mark.slow
+def test_plots_have_a_point_an_episode_and_lead_there(page, page_file):
+    figures = open_plots(page)
+    assert len(figures) >= 9
+    assert page.evaluate("plots.source.get_length()") == EPISODES
+    error = read_figures(page_file)["rows"][2][0][list(FIGURES).index("tracking_mean")]
+    host = page.locator('[data-plot="tracking_mean over episode"]')
+    page.mouse.move(*locate(page, host, 2, error))
+    tip = page.locator(".bk-Tooltip:visible .bk-tooltip-row-value")
+    tip.first.wait_for()
+    index, told, _ = tip.all_inner_texts()
+    assert int(index) == 2
+    assert float(told.removesuffix(" m")) == pytest.approx(error, abs=6e-4)
+    page.mouse.click(*locate(page, host, 2, error))
+    page.wait_for_url("**#episode-2")
+    assert page.locator("#episode-2 .timelines").get_attribute("open") is not None
+
+
+def test_any_metric_is_plotted_against_any_other(page):
+    show(page, "plots")
     page.select_option("#plot-x", "tracking_mean")
     page.select_option("#plot-y", "hand_jerk")
-    label = page.locator("#scatter svg").get_attribute("aria-label")
-    assert label == "hand_jerk over tracking_mean"
+    assert page.locator("#scatter [data-plot]").get_attribute("data-plot") == (
+        "hand_jerk over tracking_mean"
+    )
+    axes = open_plots(page)[-1]["axes"]
+    assert {axis["label"] for axis in axes} == {"tracking mean [m]", "hand jerk [m/s³]"}
 
 
+@pytest.mark.slow
+def test_a_box_around_points_chooses_their_episodes(page, page_file):
+    open_plots(page)
+    place = list(FIGURES).index("tracking_mean")
+    errors = [row[0][place] for row in read_figures(page_file)["rows"]]
+    host = page.locator('[data-plot="tracking_mean over episode"]')
+    page.mouse.move(*locate(page, host, 2.5, max(errors)))
+    page.mouse.down()
+    page.mouse.move(*locate(page, host, 4.5, min(errors)), steps=5)
+    page.mouse.up()
+    page.wait_for_function(
+        "() => document.querySelector('#choice').value === 'chosen in the plots'"
+    )
+    show(page, "episodes")
+    assert read_list(page) == ["3", "4"]
+    show(page, "plots")
+    page.mouse.dblclick(*locate(page, host, 1.5, max(errors)))
+    page.wait_for_function("() => document.querySelector('#choice').value === 'all episodes'")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1360, 420])
+def test_every_axis_is_labelled_and_whole(page, width):
+    page.set_viewport_size({"width": width, "height": 900})
+    figures = open_plots(page)
+    show(page, "episodes")
+    open_timelines(page, 1)
+    timeline = "document.querySelector('#episode-1').timeline"
+    bands, *panels = page.evaluate(f"({FIGURES_OF})({timeline}.sheet)")
+    for figure in (*figures, *panels):
+        assert len(figure["axes"]) == 2
+        assert all(axis["label"] and axis["inside"] for axis in figure["axes"])
+        assert figure["frame"] > 0.7
+    assert all(axis["inside"] for axis in bands["axes"])
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.slow
 def test_timelines_are_drawn_and_tell_values(page, page_file):
-    section = page.locator("#episode-1")
-    section.scroll_into_view_if_needed()
-    page.wait_for_selector("#episode-1 canvas")
+    section = open_timelines(page, 1)
     titles = section.locator(".timeline h4").all_text_contents()
-    assert titles == ["Operator", "Goal and robot", "Command", "Cost by term", "Planner"]
+    assert titles == ["Goal and robot", "Command", "Cost by term", "Planner", "Operator"]
     page.wait_for_timeout(200)
-    # Something is drawn on every canvas.
-    blank = """canvases => canvases.filter((c) => !c.width || !c.getContext("2d")
-        .getImageData(0, 0, c.width, c.height).data.some((v) => v)).length"""
-    canvases = section.locator("canvas")
-    assert canvases.count() > 20
-    assert canvases.evaluate_all(blank) == 0
-    # At the middle of a panel, the legend tells the value there.
-    panel = section.locator(".panel", has_text="head z [m]").first
-    panel.scroll_into_view_if_needed()
-    width = panel.locator("canvas").evaluate("canvas => canvas.clientWidth")
-    panel.locator("canvas").hover(position={"x": 42 + (width - 48) / 2 + 1, "y": 50})
-    value = panel.locator(".legend span", has_text="goal").locator("b")
-    expect = "(mark) => mark.textContent"
-    page.wait_for_function(expect, arg=value.element_handle())
-    told = float(value.text_content())
-    root = page_file.parent / "data"
-    with Source(root) as source:
-        rows = source.read(list(source.episodes)[1], ["goal.head"])["goal.head"]
-    assert told == pytest.approx(rows[FRAMES // 2 - 1 : FRAMES // 2 + 2, 2].mean(), abs=0.02)
+    # Something is drawn in every figure.
+    drawn = """figures => figures.every((figure) =>
+        [...figure.shadowRoot.querySelectorAll("canvas")].some((c) => c.width && c.getContext("2d")
+            .getImageData(0, 0, c.width, c.height).data.some((v) => v)))"""
+    figures = section.locator(".bk-Figure .bk-Canvas")
+    assert figures.count() > 12
+    assert figures.evaluate_all(drawn)
+    # In the middle of a panel, its legend and those of the others tell the values there.
+    panel = section.locator(".panel", has_text="head").nth(2)
+    assert panel.locator(".title").inner_text() == "head"
+    with Source(page_file.parent / "data") as source:
+        names = ["goal.head", "robot.head", "operator.right_wrist"]
+        rows = source.read(list(source.episodes)[1], names)
+    page.mouse.move(*locate(page, panel.locator("> div").last, FRAMES / 2 / 25, 1.2))
+    page.wait_for_function(
+        "() => document.querySelector('#episode-1 .clock').textContent.endsWith(' s')"
+    )
+    told = panel.locator(".legend b").all_inner_texts()
+    for text, column, place in ((told[4], "goal.head", 2), (told[5], "robot.head", 2)):
+        near = rows[column][FRAMES // 2 - 1 : FRAMES // 2 + 2, place]
+        assert float(text) == pytest.approx(near.mean(), abs=0.02)
+    other = section.locator(".panel", has_text="operator's right wrist").locator(".legend b").last
+    assert float(other.inner_text()) == pytest.approx(
+        rows["operator.right_wrist"][FRAMES // 2, 2], abs=0.05
+    )
+
+
+@pytest.mark.slow
+def test_curves_are_hidden_and_zoomed_together(page):
+    section = open_timelines(page, 1)
+    panel = section.locator(".panel", has_text="distance from the goal")
+    key = panel.locator(".legend button").first
+    timeline = "document.querySelector('#episode-1').timeline"
+    key.click()
+    assert page.evaluate(f"{timeline}.curves[0].line.visible") is False
+    key.click()
+    assert page.evaluate(f"{timeline}.curves[0].line.visible") is True
+    host = panel.locator("> div").last
+    page.mouse.move(*locate(page, host, 1, 0.01))
+    page.mouse.down()
+    page.mouse.move(*locate(page, host, 2, 0.01), steps=5)
+    page.mouse.up()
+    ranges = page.evaluate(
+        f"{timeline}.sheet.document.roots().map(({{ x_range }}) => [x_range.start, x_range.end])"
+    )
+    np.testing.assert_allclose(ranges, [(1, 2)] * len(ranges), atol=0.05)
+    page.mouse.dblclick(*locate(page, host, 1.5, 0.01))
+    page.wait_for_function(f"() => {timeline}.range.start === 0")
 
 
 def test_what_means_harm_is_text(page):
-    page.locator("#episode-0").scroll_into_view_if_needed()
-    page.wait_for_selector("#episode-0 canvas")
+    open_timelines(page, 0)
     assert page.title() == "Dataset data"
     assert page.problems == []
 
@@ -198,7 +338,8 @@ def test_pictures_and_a_partial_result_of_a_foreign_dataset(browser, foreign, tm
     path = tmp_path / "page.html"
     assert main(["report", "--root", str(foreign), "--out", str(path), "--pictures", "5"]) == 0
     assert (
-        "left out, for want of columns: operator (no operator.head, …)" in capsys.readouterr().out
+        "left out, for want of columns: goal and robot (no goal.* beside robot.*)"
+        in capsys.readouterr().out
     )
     with open_page(browser, path) as page:
         assert "this dataset lacks columns" in page.inner_text("#missing")
@@ -206,12 +347,14 @@ def test_pictures_and_a_partial_result_of_a_foreign_dataset(browser, foreign, tm
         sizes = page.locator(".strip img").evaluate_all("all => all.map((i) => i.naturalWidth)")
         assert sizes == [32] * 10
         section = page.locator("#episode-0")
-        section.scroll_into_view_if_needed()
-        page.wait_for_selector("#episode-0 canvas")
-        assert section.locator(".timeline h4").all_text_contents() == ["Command"]
+        # A click on a picture opens the timelines at its time.
         section.locator("figure").nth(2).click()
         assert section.locator(".clock").inner_text() == "1.40 s"
         assert section.locator("figure.near").count() == 1
+        open_timelines(page, 0)
+        assert section.locator(".timeline h4").all_text_contents() == ["Command"]
+        names = section.locator(".legend button").all_inner_texts()
+        assert [name.split()[1] for name in names] == ["a.pos", "b.pos", "c.pos"]
         assert page.problems == []
 
 
@@ -225,9 +368,11 @@ def test_timelines_hold_the_columns(page_file):
     with Source(root) as source:
         entry = list(source.episodes)[1]
         rows = source.read(entry, ["goal.head", "robot.head", "retargeter.cost", "operator.head"])
-    head = next(panel for panel in groups["Goal and robot"] if panel["title"] == "head x")
-    for series, column in zip(head["series"], ("goal.head", "robot.head"), strict=True):
-        np.testing.assert_allclose(decode(series), rows[column][:, 0], atol=1e-4)
+    head = next(panel for panel in groups["Goal and robot"] if panel["title"] == "head")
+    series = {each["name"]: decode(each) for each in head["series"]}
+    for place, axis in enumerate("xyz"):
+        np.testing.assert_allclose(series[f"{axis} goal"], rows["goal.head"][:, place], atol=1e-4)
+        np.testing.assert_allclose(series[axis], rows["robot.head"][:, place], atol=1e-4)
     names = [series["name"] for series in groups["Cost by term"][0]["series"]]
     assert "tracking" in names
     bands = {band["name"]: band["runs"] for band in timeline["bands"]}
@@ -254,7 +399,7 @@ def test_a_chosen_part(made, tmp_path, capsys):
     assert [row[0][0] for row in read_figures(path)["rows"]] == [1, 3, 4, 5]
     assert re.findall(r'id="episode-(\d+)"', text) == ["3", "5"]
     assert "Only 4 of 6 episodes" in text
-    assert "Pictures and timelines of 2 of 4 episodes, evenly" in text
+    assert "Images and timelines of 2 of 4 episodes, evenly" in text
     assert main(["report", *flags, "--overwrite", "--episodes", "1,9"]) == 1
     assert capsys.readouterr().err == f"error: dataset '{made}': it has no episode 9 (it has 6)\n"
     assert path.read_text() == text
@@ -375,7 +520,9 @@ def test_what_no_task_judged_has_not_failed(browser, tmp_path, task):
     assert main(["report", "--root", str(root), "--out", str(tmp_path / "page.html")]) == 0
     with open_page(browser, tmp_path / "page.html") as page:
         assert page.locator(".mark.failed").first.is_visible() == bool(task)
+        assert not page.locator("#bar").is_visible()
         assert not page.locator("#table").is_visible()
         assert not page.locator("#plots").is_visible()
         assert page.locator(".episode h3").is_visible()
+        page.locator(".bands .bk-Figure").wait_for()
         assert "20.0 to" not in page.inner_text("#summary")

@@ -1,14 +1,14 @@
-"""Write a page that shows a dataset: one file with figures, plots, pictures and timelines.
+"""Write a page that shows a dataset: one file with images, timelines, metrics and plots.
 
     xop-curate report --root outputs/week --out week.html
     xop-curate report --root outputs/week --out week.html --episodes 0,3,8-11 --overwrite
     xop-curate report --root outputs/week --dry-run
 
-The page needs no other file and no network. It has a table of all episodes, which sorts by any
-figure, plots of the figures over them, and of each episode a strip of pictures and its timelines:
-operator, goal and robot, command, cost by term, planner, gaps in tracking. What a dataset has no
-columns for is left out, and the page says so; so it does of what cannot be read, and the exit
-code is 1 then.
+The page needs no other file and no network. It shows of each episode a strip of images and, once
+opened, its timelines: goal and robot, command, cost by term, planner, operator, gaps in tracking;
+a table of all episodes, which sorts by any metric; and plots of the metrics over them. What a
+dataset has no columns for is left out, and the page says so; so it does of what cannot be read, and
+the exit code is 1 then.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from xop_lerobot.core.errors import BadDataset, BadValue
 from xop_lerobot.curate.arguments import add_source, parse_episodes, show_progress
 from xop_lerobot.curate.source import Source
 
-SUMMARY = "write one HTML page: figures, plots, pictures and timelines of the episodes"
+SUMMARY = "write one HTML page: images, timelines, metrics and plots of the episodes"
 
 PAGE = "index.html"
 _SUFFIXES = (".html", ".htm")

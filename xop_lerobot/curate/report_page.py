@@ -69,9 +69,9 @@ def make_section(source: Source, finding: Finding, limits: Limits) -> tuple[str,
         f'<section class="episode" id="episode-{index}" data-episode="{index}">',
         _make_heading(finding),
         *(f'<p class="problem">{escape(each)}</p>' for each in (*finding.problems, *problems)),
-        strips,
-        f'<div class="timeline"></div><script type="application/json">{dump_script(timeline)}'
-        "</script>",
+        f'<div class="strips">{strips}</div>',
+        '<details class="timelines"><summary>timelines</summary><div class="timeline"></div>'
+        f'<script type="application/json">{dump_script(timeline)}</script></details>',
         _make_facts(finding),
         "</section>\n",
     ]
@@ -99,9 +99,8 @@ def _make_heading(finding: Finding) -> str:
     ]
     task = " | ".join(entry.tasks)
     return (
-        f"<h3>Episode {entry.index} {''.join(marks)} <small>{escape(task)}</small>"
-        '<a class="up" href="#episodes">table</a></h3>'
-        f'<p class="chips">{"".join(chips)}</p>'
+        f"<h3>Episode {entry.index} {''.join(marks)} <small>{escape(task)}</small></h3>"
+        f'<p class="chips">{" ".join(chips)}</p>'
     )
 
 
@@ -224,10 +223,13 @@ def _make_facts(finding: Finding) -> str:
     lines = "".join(
         f"<div><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>" for name, text in rows
     )
-    return f"<details><summary>all figures and facts</summary><dl>{lines}</dl></details>"
+    return f"<details><summary>all metrics and metadata</summary><dl>{lines}</dl></details>"
 
 
 _ASSETS = resources.files("xop_lerobot.curate") / "page"
+_SCRIPTS = ("report.js", "figures.js")
+_WHOLE = 3
+"""Lines of the totals that are not counts and ranges of metrics."""
 _DIGITS = 7
 """Significant digits of a figure in the page."""
 
@@ -339,20 +341,22 @@ class Report:
             missing: What could not be shown for want of columns.
         """
         style = (_ASSETS / "report.css").read_text(encoding="utf-8")
-        script = (_ASSETS / "report.js").read_text(encoding="utf-8")
+        views = (_ASSETS / "views.html").read_text(encoding="utf-8")
+        scripts = [(_ASSETS / name).read_text(encoding="utf-8") for name in _SCRIPTS]
         try:
             with self._draft.open("w", encoding="utf-8") as page:
                 page.write(make_head(f"Dataset {self._source.root.resolve().name}", style))
                 page.write(self._make_summary(faults, missing))
-                page.write((_ASSETS / "table.html").read_text(encoding="utf-8"))
                 page.write('<script type="application/json" id="figures">')
                 page.write(f'{{"judged":{dump_script(self._judged)},')
                 page.write(f'"figures":{dump_script(self._list_figures())},"rows":[')
                 _copy(self._rows, page)
-                page.write(f"]}}</script>\n<h2>Episode by episode</h2>\n{self._make_note()}\n")
+                page.write(f'\n]}}</script>{views}<div class="view" id="view-episodes">')
                 _copy(self._sections, page)
-                page.write((_ASSETS / "plots.html").read_text(encoding="utf-8"))
-                page.write(f"<script>\n{script}</script>{FOOT}")
+                page.write(f'</div>\n{self._make_notes()}\n<script type="text/plain" id="bokeh">')
+                page.write(f"{_read_bokeh()}</script>")
+                page.writelines(f"\n<script>\n{script}</script>" for script in scripts)
+                page.write(FOOT)
                 page.flush()
                 os.fsync(page.fileno())
             os.replace(self._draft, self._path)
@@ -361,13 +365,7 @@ class Report:
 
     def _list_figures(self) -> list[dict[str, object]]:
         return [
-            {
-                "name": figure.name,
-                "kind": figure.kind.name.lower(),
-                "unit": figure.unit,
-                "text": figure.text,
-                "shown": figure.name in SHOWN,
-            }
+            figure._asdict() | {"kind": figure.kind.name.lower(), "shown": figure.name in SHOWN}
             for figure in FIGURES.values()
         ]
 
@@ -375,6 +373,8 @@ class Report:
         source = self._source
         root = source.root.resolve()
         lines = self._totals.format().splitlines()
+        if self.episodes == 1:  # whose section says the rest
+            lines = lines[:_WHOLE]
         parts = [
             f"<h1>Dataset {escape(root.name)}</h1>",
             f'<p class="note">{escape(root)} · {escape(source.robot or "robot not stated")} · '
@@ -393,17 +393,33 @@ class Report:
                 f'<p class="note">Only {self.episodes} of {source.total_episodes} episodes, '
                 "chosen by --episodes.</p>"
             )
-        unknown = [name for name in FIGURES if name in self._unknown]
         if missing:
             parts.append(
                 '<p class="note" id="missing"><b>Partial:</b> this dataset lacks columns, so that '
                 f"there is no timeline of {escape('; '.join(missing))}.</p>"
             )
+        return "\n".join(parts)
+
+    def _make_notes(self) -> str:
+        """Make what stands below the episodes."""
+        limits = self._limits
+        text = (
+            f"At most {limits.pictures} images of a camera, {limits.width} pixels wide, and "
+            f"{limits.points} points of a curve; of longer ones the lowest and the highest "
+            "value of each piece, so that no peak is lost."
+        )
+        if self._shown < self.episodes:
+            text = (
+                f"Images and timelines of {self._shown} of {self.episodes} episodes, evenly "
+                f"chosen; --detailed and --episodes choose others. {text}"
+            )
+        parts = [f'<p class="note" id="limits">{escape(text)}</p>']
+        unknown = [name for name in FIGURES if name in self._unknown]
         if unknown and self.episodes:
             parts.append(
                 f'<p class="note">Not known of any episode: {escape(", ".join(unknown))}.</p>'
             )
-        config = json.dumps(source.read_config(), indent=2, ensure_ascii=False)
+        config = json.dumps(self._source.read_config(), indent=2, ensure_ascii=False)
         if config != "{}":
             parts.append(
                 "<details><summary>configuration of the session</summary>"
@@ -411,25 +427,20 @@ class Report:
             )
         return "\n".join(parts)
 
-    def _make_note(self) -> str:
-        limits = self._limits
-        text = (
-            f"At most {limits.pictures} pictures of a camera, {limits.width} pixels wide, and "
-            f"{limits.points} points of a curve; of longer ones the lowest and the highest "
-            "value of each piece, so that no peak is lost."
-        )
-        if self._shown < self.episodes:
-            text = (
-                f"Pictures and timelines of {self._shown} of {self.episodes} episodes, evenly "
-                f"chosen; --detailed and --episodes choose others. {text}"
-            )
-        return f'<p class="note" id="limits">{escape(text)}</p>'
-
 
 def _has_task(source: Source) -> bool:
     """Whether a task of this project ran, which judges its episodes."""
     robot = source.read_config().get("robot")
     return not isinstance(robot, dict) or bool(robot.get("task", True))
+
+
+def _read_bokeh() -> str:
+    """Read the library that draws the figures, as it may stand in a `<script>`."""
+    from bokeh.util.paths import bokehjs_path  # noqa: PLC0415 a tenth of a second, if any
+
+    files = (bokehjs_path() / "js" / f"{name}.min.js" for name in ("bokeh", "bokeh-api"))
+    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    return text.replace("</script", "<\\/script")
 
 
 def _copy(source: IO[str], target: IO[str]) -> None:

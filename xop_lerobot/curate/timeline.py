@@ -34,6 +34,8 @@ from xop_lerobot.evaluation.metrics import compute_pose_errors, find_runs
 POSE = 7
 MOST_ENTRIES = 32
 """Entries of an action that are shown, where nothing tells which of them matter."""
+_TOGETHER = 4
+"""Entries of an action in a panel, where nothing tells their units."""
 MOST_RUNS = 400
 """Runs of a band that are shown."""
 _AXES = ("x", "y", "z")
@@ -227,18 +229,21 @@ def _build_goals(episode: Episode) -> list[Panel]:
         )
         known = np.any(goal[:, 3:], axis=1) & np.all(np.isfinite(goal), axis=1)
         name = frame.replace("_", " ")
+        curves = []
         for place, axis in enumerate(_AXES):
-            curves = (
-                Series("goal", _mask(goal[:, place], known), "goal", 1),
-                Series("robot", robot[:, place]),
-            )
-            panels.append(Panel(f"{name} {axis}", "m", curves))
+            curves += [
+                Series(f"{axis} goal", _mask(goal[:, place], known), "goal", place),
+                Series(axis, robot[:, place], colour=place),
+            ]
+        panels.append(Panel(name, "m", tuple(curves)))
         distance, angle = compute_pose_errors(robot, goal)
         distances.append(Series(name, _mask(distance, known), colour=index))
         angles.append(Series(name, _mask(angle, known), colour=index))
-    panels.append(Panel("distance from the goal", "m", tuple(distances)))
-    panels.append(Panel("angle from the goal", "rad", tuple(angles)))
-    return panels
+    return [
+        Panel("distance from the goal", "m", tuple(distances)),
+        Panel("angle from the goal", "rad", tuple(angles)),
+        *panels,
+    ]
 
 
 # Command, cost, planner.
@@ -258,24 +263,29 @@ def _build_command(episode: Episode) -> list[Panel]:
     dims = () if morphology is None else morphology.command_space.dims
     names = {name: _get_names(episode, name) for name in rows}
     if ACTION in rows and dims and all(dim.key in names[ACTION] for dim in dims):
-        panels = []
+        by_unit: dict[str, list[Series]] = {}
         for dim in dims:
-            curves = [Series("executed", rows[ACTION][:, names[ACTION].index(dim.key)])]
+            curves = by_unit.setdefault(dim.unit, [])
+            colour = len(curves) // 2
             if dim.name in names.get(_COMMAND, ()):
                 wanted = rows[_COMMAND][:, names[_COMMAND].index(dim.name)]
-                curves.insert(0, Series("wanted", wanted, "goal", 1))
-            panels.append(Panel(dim.name, dim.unit, tuple(curves)))
-        return panels
+                curves.append(Series(f"{dim.name} wanted", wanted, "goal", colour))
+            executed = rows[ACTION][:, names[ACTION].index(dim.key)]
+            curves.append(Series(dim.name, executed, colour=colour))
+        return [Panel("", unit, tuple(curves)) for unit, curves in by_unit.items()]
     if ACTION not in rows:
         return []
-    panels = []
-    for place in range(min(rows[ACTION].shape[1], MOST_ENTRIES)):
-        known = place < len(names[ACTION])
-        name = names[ACTION][place] if known else f"action {place}"
-        curves = [Series("action", rows[ACTION][:, place], "goal", 1)]
-        if known and name in names.get(_STATE, ()):
-            curves.append(Series("state", rows[_STATE][:, names[_STATE].index(name)]))
-        panels.append(Panel(name, "", tuple(curves)))
+    panels, count = [], min(rows[ACTION].shape[1], MOST_ENTRIES)
+    for first in range(0, count, _TOGETHER):
+        curves = []
+        for colour, place in enumerate(range(first, min(first + _TOGETHER, count))):
+            known = place < len(names[ACTION])
+            name = names[ACTION][place] if known else f"action {place}"
+            curves.append(Series(f"{name} wanted", rows[ACTION][:, place], "goal", colour))
+            if known and name in names.get(_STATE, ()):
+                state = rows[_STATE][:, names[_STATE].index(name)]
+                curves.append(Series(name, state, colour=colour))
+        panels.append(Panel("", "", tuple(curves)))
     return panels
 
 
@@ -323,11 +333,11 @@ def _build_plan(episode: Episode) -> list[Panel]:
 
 PARTS = (
     Part("States", "operator, mode or idle time", _find_states, _build_states),
-    Part("Operator", "operator.head, …", _find_operator, _build_operator),
     Part("Goal and robot", "goal.* beside robot.*", _find_goals, _build_goals),
     Part("Command", "action", _find_command, _build_command),
     Part("Cost by term", "retargeter.cost", _find_cost, _build_cost),
     Part("Planner", "retargeter.health", _find_plan, _build_plan),
+    Part("Operator", "operator.head, …", _find_operator, _build_operator),
 )
 """All parts, in their order on a page."""
 
