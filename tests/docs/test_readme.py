@@ -204,6 +204,16 @@ def test_modules_that_are_named_exist(page: Path) -> None:
         assert any(file.endswith(f"/{name}") for file in files), f"{page.name} names {name}"
 
 
+def test_pages_that_are_named_in_files_exist() -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("this is no checkout")
+    for file in listed.stdout.split():
+        if file.endswith((".py", ".js", ".toml", ".yaml", ".yml", ".sh", "Makefile")):
+            for name in re.findall(r"\bdocs/[\w/]+\.md\b", (ROOT / file).read_text()):
+                assert (ROOT / name).exists(), f"{file} names {name}"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_examples_are_python(page: Path) -> None:
     for block in read_blocks(page, "python"):

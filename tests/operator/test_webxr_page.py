@@ -258,7 +258,7 @@ def test_troubles_in_words(desk, open_at):
         "none": "This browser has no WebXR.",
         "no device": "No headset is connected to this browser.",
         "forbidden": "This browser does not let pages use a headset.",
-        "insecure": "A headset needs an https address, or a cable: see docs/use/headset.md.",
+        "insecure": "A headset needs an https address, or a cable: see docs/use/webxr.md.",
     }
     for change, trouble in said.items():
         assert page.evaluate(find, change) == {"mode": None, "trouble": trouble}

@@ -2,7 +2,7 @@
 
 Everything but pictures is JSON text. A page sends `frame`, `pong`, `wish` and `bye`; the server
 sends `welcome`, `ping`, `display`, `pose` and `refused`, and pictures as a byte with the number of
-the camera followed by a JPEG. `docs/use/headset.md` holds every field.
+the camera followed by a JPEG. `docs/how_it_works/webxr_protocol.md` holds every field.
 """
 
 from __future__ import annotations

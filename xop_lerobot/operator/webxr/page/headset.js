@@ -9,7 +9,7 @@ const TAKE_OVER_MS = 1000; // so long a hand must be lost until a controller spe
 /** What a session can be begun as here, or why not, in words: `{mode, trouble}`. */
 export async function findMode() {
   if (!window.isSecureContext) {
-    const trouble = 'A headset needs an https address, or a cable: see docs/use/headset.md.';
+    const trouble = 'A headset needs an https address, or a cable: see docs/use/webxr.md.';
     return { mode: null, trouble };
   }
   if (!navigator.xr) return { mode: null, trouble: 'This browser has no WebXR.' };

@@ -35,7 +35,7 @@ export function explainFailure(location, answers) {
   if (location.protocol === 'https:') {
     return 'This browser shows the page but refuses its connection: it does not trust the '
       + 'certificate. Open /cert on this computer, install it and trust it, then load the page '
-      + 'again. Or use a cable: see docs/use/headset.md.';
+      + 'again. Or use a cable: see docs/use/webxr.md.';
   }
   return 'The computer shows the page but accepts no connection. Trying again.';
 }
