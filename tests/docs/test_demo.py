@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -81,3 +83,22 @@ def test_a_failing_recording_shows_its_end(
     told = capsys.readouterr().err
     assert "lerobot-record for 'g1' ended with status 7:\nthe robot is away\n" in told
     assert (tmp_path / "out" / "g1.log").read_text() == "the robot is away\n"
+
+
+@pytest.mark.slow
+def test_a_shorter_demo_is_recorded_and_shown(
+    demo: ModuleType,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in demo.build_environment(tmp_path, {}):  # what it sets goes with the test
+        monkeypatch.setenv(name, demo.build_environment(tmp_path, dict(os.environ))[name])
+    short = dataclasses.replace(demo.DEMOS["rby1"], episode_s=3.0)
+    monkeypatch.setitem(demo.DEMOS, "rby1", short)
+    assert demo.main(["--robots", "rby1", "--out", str(tmp_path)]) == 0, capsys.readouterr().err
+    assert (tmp_path / "rby1" / "meta" / "info.json").exists()
+    for suffix in ("png", "mp4", "gif"):
+        assert (tmp_path / f"rby1.{suffix}").stat().st_size > 1000
+    table = capsys.readouterr().out.split("rby1.png, .mp4 and .gif")[1]
+    assert "rby1" in table and " 75 " in table
