@@ -141,6 +141,30 @@ def test_commands_parse(page: Path, command: list[str], monkeypatch: pytest.Monk
         assert dataset.push_to_hub is False, "an example uploads nothing"
 
 
+def read_modules() -> dict[str, set[str]]:
+    """The flags that the pages give to each `python -m benchmarks.…` and `scripts.…`."""
+    modules: dict[str, set[str]] = {}
+    for page in PAGES:
+        blocks = "\n".join(read_blocks(page, "[a-z]*")).replace("\\\n", " ")
+        prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M)
+        spans = [text.replace("\n", " ") for text in re.findall(r"`([^`]+)`", prose)]
+        for line in (*blocks.splitlines(), *spans):
+            found = re.search(r"python -m ((?:benchmarks|scripts)\.\w+)(.*)", line)
+            if found:
+                flags = re.findall(r"(?<= )--[a-z-]+", found[2].split("#")[0])
+                modules.setdefault(found[1], set()).update(flags)
+    return modules
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("module", "flags"), sorted(read_modules().items()))
+def test_benchmarks_have_the_flags_that_pages_give_them(module: str, flags: set[str]) -> None:
+    command = [sys.executable, "-m", module, "--help"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert flags <= set(re.findall(r"--[a-z-]+", done.stdout)), module
+
+
 def test_a_wrong_flag_is_found(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     with pytest.raises(SystemExit):
         parse(["lerobot-replay", "--robot.type=xop_g1", "--robot.camz=1"], monkeypatch)
