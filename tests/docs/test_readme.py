@@ -57,6 +57,7 @@ def find_config_class(name: str) -> type:
     elif name == "lerobot-replay":
         from lerobot.scripts.lerobot_replay import ReplayConfig as Config
     elif name == "lerobot-train":
+        import lerobot.policies  # noqa: F401  registers the types of policies
         from lerobot.configs.train import TrainPipelineConfig as Config
     elif name == "lerobot-calibrate":
         from lerobot.scripts.lerobot_calibrate import CalibrateConfig as Config
