@@ -1,7 +1,7 @@
-"""RB-Y1 M v1.3: its numbers, as in the maker's URDF (rby1-sdk, Apache-2.0).
+"""Link table of RB-Y1 M v1.3, from the manufacturer's URDF (rby1-sdk, Apache-2.0).
 
-Torso, upper arms and head are those of RB-Y1 A; base, wheels, forearms, wrists and hands differ
-(docs/how_it_works/models.md).
+Torso, upper arms and head are those of RB-Y1 A; base, wheels, forearms, wrists and hands differ.
+See docs/how_it_works/models.md.
 """
 
 from dataclasses import replace
