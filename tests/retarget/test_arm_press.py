@@ -11,8 +11,8 @@ from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.retarget.arms.contact import (
     CARRYING_S,
     HOLDING_S,
-    MOST_SQUEEZE,
-    MOST_WAY,
+    MAX_SQUEEZE,
+    MAX_YIELD,
     ArmBias,
     ArmHold,
     ArmLoad,
@@ -139,15 +139,15 @@ def test_hands_that_squeeze_too_hard_give_way_until_they_do_not():
     stiffness, inside, felt, hands = 1e4, 0.01, 0.0, ArmYield()  # 100 N if nothing gave way
     force = 0.0
     for _ in range(200):
-        force = stiffness * (inside - hands.way)
+        force = stiffness * (inside - hands.displacement)
         felt += -np.expm1(-DT / 0.3) * (force - felt)
         hands.update(felt, DT)
-    assert force == pytest.approx(MOST_SQUEEZE, rel=0.02)
+    assert force == pytest.approx(MAX_SQUEEZE, rel=0.02)
     left, right = hands.part(LEFT, RIGHT)
-    np.testing.assert_allclose(left - LEFT, [0, hands.way, 0])
-    np.testing.assert_allclose(right - RIGHT, [0, -hands.way, 0])
+    np.testing.assert_allclose(left - LEFT, [0, hands.displacement, 0])
+    np.testing.assert_allclose(right - RIGHT, [0, -hands.displacement, 0])
     for _ in range(100):  # something less thick is between them
         hands.update(20.0, DT)
-    assert hands.way == 0
+    assert hands.displacement == 0
     hands.update(1e6, 10.0)
-    assert hands.way == MOST_WAY
+    assert hands.displacement == MAX_YIELD

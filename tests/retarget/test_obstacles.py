@@ -305,8 +305,8 @@ def test_a_file_that_is_not_there_or_no_yaml(tmp_path):
 
 
 BLIND = {
-    ("g1", "mpc"): "robot 'g1' keeps clear of nothing. Robots that do: rby1, rby1m",
-    ("rby1", "direct"): "retargeter 'direct' keeps clear of nothing. Retargeters that do: mpc",
+    ("g1", "mpc"): "robot 'g1' does not avoid obstacles. Robots that do: rby1, rby1m",
+    ("rby1", "direct"): "retargeter 'direct' does not avoid obstacles. Retargeters that do: mpc",
 }
 
 
@@ -335,7 +335,7 @@ def test_it_is_refused_before_anything_is_recorded(tmp_path):
     robot = XopG1(XopG1Config(session="obstacles", cameras=[]))
     retargeter = RetargeterConfig(obstacles=write(tmp_path, FILE))
     with pytest.raises(
-        BadValue, match="robot 'g1' keeps clear of nothing. Robots that do: rby1, rby1m"
+        BadValue, match="robot 'g1' does not avoid obstacles. Robots that do: rby1, rby1m"
     ):
         Xop(XopConfig(session="obstacles", retargeter=retargeter))
     robot.disconnect()
@@ -368,7 +368,7 @@ def test_who_drives_a_g1_in_a_room_is_warned(caplog):
     info = RobotInfo("xop_g1", morphology, "default", None, "room", 25, 0)
     config = TeleoperationConfig(retargeter=RetargeterConfig(type="direct"))
     Teleoperation(config, info).disconnect()
-    assert "in scene 'room' ignored: retargeter 'direct' keeps clear of nothing" in caplog.text
+    assert "in scene 'room' ignored: retargeter 'direct' does not avoid obstacles" in caplog.text
 
 
 def test_a_file_adds_to_the_scene(tmp_path):

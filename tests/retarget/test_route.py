@@ -129,7 +129,7 @@ def test_a_head_is_at_its_goal_however_its_waist_is_turned(rby1):
     for _ in range(20):
         x, y, heading, look = rng.uniform(-1, 1), rng.uniform(-1, 1), *rng.uniform(-1.5, 1.5, 2)
         aim = _Aim(0.3, -0.7, look, 1.9, (axis - rby1.pivot, 0.0), ahead - axis, rby1.driving)
-        across, along = aim.find_way(x, y, heading)
+        across, along = aim.find_path(x, y, heading)
         base = np.array([x + across, y + along]) - rby1.pivot * np.array(
             [math.cos(heading), math.sin(heading)]
         )

@@ -1,6 +1,6 @@
-"""Commands that are tried beside the samples, and what is done about a dangerous prediction.
+"""Fixed candidate commands that are tried beside the noisy samples, and the safety check of a plan.
 
-`judge` slows down or vetoes a plan whose predicted motion falls or collides.
+`Candidates` makes the commands; `judge` slows down or vetoes a plan whose samples fall or collide.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class Candidates:
     Args:
         morphology: The robot.
         model: Its planning model.
-        decision: What is decided.
-        command_model: What a decision does.
-        support: Area over which the centre of mass stays, None for a robot that balances itself.
-        load: What joints bear of the weight above them, None where that does not count.
+        decision: Layout of the decision vector.
+        command_model: First-order model of the effect of a decision.
+        support: Support area for the centre of mass; None for a robot that balances itself.
+        load: Static loads of the joints; None if they are not limited.
 
     Attributes:
         proposals: The kinematic proposal of each mode.
@@ -58,7 +58,7 @@ class Candidates:
     def configure(
         self, configs: Mapping[Mode, MpcConfig], sites: Mapping[str, str], upright: bool
     ) -> None:
-        """Take other parameters, or other targets with their sites."""
+        """Set the parameters, and the targets with their sites."""
         self.proposals = {
             mode: KinematicProposal(
                 self._model,
@@ -73,7 +73,7 @@ class Candidates:
         }
 
     def reset(self) -> None:
-        """Forget what was mapped directly before."""
+        """Forget the state of the direct mapping."""
         self._direct = None
 
     def propose(
@@ -84,14 +84,14 @@ class Candidates:
         config: MpcConfig,
         start: np.ndarray,
     ) -> np.ndarray:
-        """Compute the kinematic proposal, or the executed command where it is not asked for.
+        """Compute the kinematic proposal, or the executed command if `config` uses none.
 
         Args:
-            state: Where the robot is, with the decision that it executes.
-            reference: What is to be followed; the last of its goals are those of the proposal.
+            state: The planner's state, with the executed decision.
+            reference: The reference trajectory; its last goals are those of the proposal.
             mode: Mode of the robot.
             config: Parameters of the mode.
-            start: Decision from which the iteration starts. Shape (n,).
+            start: Initial guess. Shape (n,).
 
         Returns:
             Decision. Shape (n,).
@@ -102,7 +102,7 @@ class Candidates:
         natural, free = None, None
         if served is not None:
             natural = served.natural
-            if served.detour:  # the posture is taken up straight; wheels do the rest
+            if served.detour:  # move straight to the posture; only the velocities are optimised
                 reach = self._decision.space.compute_max_rate(mode, executed) * config.proposal_s
                 natural = start = pace(executed, natural, reach)
                 free = self._command_model.acting(mode) & self._command_model.is_velocity()
@@ -127,58 +127,59 @@ class Candidates:
         proposal: np.ndarray,
         config: MpcConfig,
     ) -> np.ndarray:
-        """All fixed decisions to try, in the order of `config.candidates`. Shape (c, n)."""
+        """The fixed candidates, in the order of `config.candidates`. Shape (c, n)."""
         candidates, executed = [], now.executed
         space = self._decision.space
         for name in config.candidates:
             if name == "proposal":
                 candidates.append(proposal)
             elif name == "paced":
+                # As far as the rate limits allow within two control periods.
                 rates = space.compute_max_rate(goal.mode, executed)
                 candidates.append(pace(executed, proposal, rates * 2 / config.control_hz))
             elif name == "direct":
                 candidates.append(self._decision.join(self._map(state, goal), state.arms))
             elif name == "previous":
                 candidates.append(executed)
-            else:
+            else:  # "stop"
                 candidates.append(np.where(self._command_model.is_velocity(), 0.0, executed))
         return np.array(candidates).reshape(-1, len(space))
 
     def _map(self, state: RobotState, goal: Goal) -> np.ndarray:
-        """The direct mapping's command. Shape (k,)."""
+        """Command of the direct mapping. Shape (k,)."""
         if self._direct is None:
             self._direct = DirectRetargeter(self._morphology, self._model)
             self._direct.reset(state)
         return self._direct.plan(state, goal).command
 
 
-_SLOW, _VETO = 0.1, 0.5  # share of the weight on failing samples
+_SLOW, _VETO = 0.1, 0.5  # risk above which a plan is slowed down, and from which it is vetoed
 
 
 class Intervention(IntEnum):
-    """Why a plan is not what the samples' weighted mean says."""
+    """Reason why a plan differs from the weighted mean of its samples."""
 
     NONE = 0
     SLOWED_FALL = 1
-    """Velocities are reduced: some of the likely futures fall."""
+    """Velocities are reduced: some of the weight is on samples that fall."""
     SLOWED_COLLISION = 2
-    """Velocities are reduced: some of the likely futures touch an obstacle."""
+    """Velocities are reduced: some of the weight is on samples that touch an obstacle."""
     VETOED_FALL = 3
-    """The plan is replaced by the best safe sample: most of the likely futures fall."""
+    """The plan is replaced by the best safe sample: most of the weight is on falls."""
     VETOED_COLLISION = 4
-    """The plan is replaced by the best safe sample: most of them touch an obstacle."""
+    """The plan is replaced by the best safe sample: most of the weight is on collisions."""
     DIVERGED = 5
-    """No prediction is a number: velocities go to zero, the posture holds."""
+    """No prediction is finite: velocities go to zero, the posture is held."""
 
 
 class Verdict(NamedTuple):
-    """The judgement on a plan.
+    """Result of the safety check of a plan.
 
     Attributes:
-        intervention: What is to be done.
-        risk: Weight on samples that fail, 0 to 1.
-        sample: The sample to execute instead, None for the plan itself.
-        scale: Factor on the base's velocities, 1 for the plan itself.
+        intervention: The intervention and its reason.
+        risk: Weight on failing samples, 0 to 1.
+        sample: Sample to execute instead; None to keep the plan.
+        scale: Factor on the base velocities; 1 to keep the plan.
     """
 
     intervention: Intervention
@@ -190,19 +191,19 @@ class Verdict(NamedTuple):
 def judge(
     weights: np.ndarray, costs: np.ndarray, falls: np.ndarray, touches: np.ndarray, stop: int | None
 ) -> Verdict:
-    r"""Judge a plan by the samples it is the mean of.
+    r"""Check a plan by the samples that it is the weighted mean of.
 
-    The risk is :math:`r = \sum_i w_i [\text{sample } i \text{ fails}]`. Up to 0.1 the plan stays.
-    Above, the base's velocities are scaled by 1 − r. From 0.5 on, the cheapest sample
-    that does not fail takes its place. If all fail, it is the sample `stop`, or without one the
-    executed posture at no velocity.
+    The risk is :math:`r = \sum_i w_i [\text{sample } i \text{ fails}]`. Up to 0.1 the plan is kept.
+    Above, the base velocities are scaled by 1 − r. From 0.5 on, the cheapest sample that does not
+    fail replaces the plan; if all fail, it is the sample `stop` or, without one, the executed
+    posture at zero velocity.
 
     Args:
         weights: Weights of the samples. Shape (K,).
-        costs: Their costs, NaN for those that diverged. Shape (K,).
-        falls: Which of them fall, or diverge. Shape (K,), bool.
-        touches: Which of them touch an obstacle. Shape (K,), bool.
-        stop: Index of the sample that stops, None if there is none.
+        costs: Costs of the samples, NaN for diverged ones. Shape (K,).
+        falls: Which samples fall or diverge. Shape (K,), bool.
+        touches: Which samples touch an obstacle. Shape (K,), bool.
+        stop: Index of the stopping sample; None if there is none.
     """
     finite = np.isfinite(costs)
     if not finite.any():

@@ -1,4 +1,8 @@
-"""What can be changed while the robot is driven, and the settings that are in force."""
+"""Settings of the planner that can be changed while the robot is driven.
+
+`Settings` are those in force, a `Change` is a validated difference, and `apply_change` computes the
+settings after it. `parse_change` reads a change from JSON.
+"""
 
 from __future__ import annotations
 
@@ -17,26 +21,27 @@ from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig, 
 
 MAX_WEIGHT = 1e6
 WEIGHT_NAMES = tuple(each.name for each in dataclasses.fields(CostWeights))
-_UNBOUNDED = ("collision_range",)
+_UNBOUNDED = ("collision_range",)  # may be infinite, as in the paper's formula
+# Other weights are relative to that of position, and barriers need a positive decay and range.
 _POSITIVE = ("collision_decay", "collision_velocity_decay", "collision_range", "position")
 
 
 @dataclass(frozen=True)
 class Change:
-    """What is to be different from the next tick on; what is None or empty stays as it is.
+    """Settings to change from the next tick on; None or empty keeps a setting.
 
     Attributes:
-        preset: Preset to take; it forgets the weights that were set before.
-        weights: Cost weights by name, for both modes, over those of the preset.
-        variant: Binding to take, one that the robot names; its targets and body.
-        targets: Tracked frames that the retargeter shall follow.
+        preset: New preset; it discards weights that were set before.
+        weights: Cost weights by name, for both modes; they override those of the preset.
+        variant: New binding of targets to the body, one that the robot names.
+        targets: Tracked frames that the retargeter follows.
         body: Commands and arm joints that it may move for them; the whole command if empty.
         constraints: Constraints by name, on or off.
-        mode: Mode to go to.
+        mode: New mode.
 
     Raises:
-        BadValue: If a value is of the wrong kind or out of its range; says what it may be.
-        UnknownName: If a name is not one of the known ones; lists them.
+        BadValue: If a value has the wrong type or is out of range; names what is allowed.
+        UnknownName: If a name is unknown; lists the known ones.
     """
 
     preset: str | None = None
@@ -63,7 +68,7 @@ class Change:
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the change as `parse_change` reads it; what it leaves alone is left out."""
+        """Return the change in the form that `parse_change` reads, without unchanged settings."""
         plain = {
             "preset": self.preset,
             "weights": _to_json(self.weights) or None,
@@ -80,10 +85,10 @@ CHANGE_NAMES = tuple(each.name for each in dataclasses.fields(Change))
 
 
 def split_change(change: Change) -> dict[tuple[str, ...], Any]:
-    """Split a change into the single things that it sets, in the order in which they apply.
+    """Split a change into single settings, in the order in which they apply.
 
     Returns:
-        Values by what is set: `("preset",)`, `("weights", name)`, `("constraints", name)`, ….
+        Values by setting: `("preset",)`, `("weights", name)`, `("constraints", name)`, ….
     """
     parts: dict[tuple[str, ...], Any] = {}
     for name in CHANGE_NAMES:
@@ -96,7 +101,7 @@ def split_change(change: Change) -> dict[tuple[str, ...], Any]:
 
 
 def join_change(parts: Mapping[tuple[str, ...], Any]) -> Change:
-    """Make the change that sets `parts`, as `split_change` splits it."""
+    """Make the change that sets `parts`; the inverse of `split_change`."""
     values: dict[str, Any] = {}
     for (name, *key), value in parts.items():
         if key:
@@ -110,8 +115,8 @@ def check_weight(name: object, value: object) -> None:
     """Check a cost weight.
 
     Raises:
-        UnknownName: If there is none of this name.
-        BadValue: If it is no number within its range.
+        UnknownName: If there is no weight of this name.
+        BadValue: If the value is not a number in its range.
     """
     if name not in WEIGHT_NAMES:
         raise UnknownName("weight", name, WEIGHT_NAMES)
@@ -128,7 +133,7 @@ def check_weight(name: object, value: object) -> None:
 
 
 def parse_change(data: object) -> Change:
-    """Read a change as it comes in JSON.
+    """Parse a change from decoded JSON.
 
     Args:
         data: An object with any of the attributes of `Change`; `mode` is `stationary` or
@@ -168,7 +173,7 @@ def make_toggle(name: str, settings: Settings) -> Change:
     """Make the change that toggles a constraint, or a preset against `default`.
 
     Raises:
-        UnknownName: If `name` is neither; lists those that are.
+        UnknownName: If `name` is neither a constraint nor a preset; lists both.
     """
     if name in CONSTRAINTS:
         return Change(constraints={name: name not in settings.constraints})
@@ -196,15 +201,15 @@ def _describe(value: object) -> str:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is in force: the preset, what was changed of it, and what drives what.
+    """Settings in force: preset, manual weights, and the binding of targets to the body.
 
     Attributes:
         preset: Preset.
-        weights: Weights that were set by hand, over those of the preset.
-        variant: Binding that was taken last.
+        weights: Weights that were set manually; they override those of the preset.
+        variant: Binding that was selected last.
         targets: Tracked frames that the retargeter follows.
-        body: What it may move for them; empty for the whole command.
-        constraints: Constraints that hold.
+        body: Commands and arm joints that it may move for them; empty for the whole command.
+        constraints: Active constraints.
     """
 
     preset: str
@@ -215,7 +220,7 @@ class Settings:
     constraints: frozenset[str]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings as JSON knows them."""
+        """Return a JSON-compatible dictionary."""
         return {
             "preset": self.preset,
             "weights": _to_json(self.weights),
@@ -230,7 +235,7 @@ def make_settings(morphology: Morphology, config: RetargeterConfig) -> Settings:
     """Make the settings that a session of `morphology` starts with.
 
     Raises:
-        UnknownName: If `config` names a variant, target or part of the body that is not there.
+        UnknownName: If `config` names an unknown variant, target or part of the body.
     """
     variant = config.variant or next(iter(morphology.variants))
     start = Settings(config.preset, {}, variant, (), (), frozenset(split_names(config.constraints)))
@@ -246,11 +251,11 @@ def make_settings(morphology: Morphology, config: RetargeterConfig) -> Settings:
 
 
 def apply_change(morphology: Morphology, settings: Settings, change: Change) -> Settings:
-    """Compute the settings after `change`; nothing else is touched.
+    """Compute the settings after `change`, without side effects.
 
     Raises:
         UnknownName: If the robot has no such variant, target or part of the body.
-        BadValue: If no target would be left, or one is named twice.
+        BadValue: If no target would be left, or a name occurs twice.
     """
     weights = {} if change.preset is not None else dict(settings.weights)
     variant, targets, body = settings.variant, settings.targets, settings.body
@@ -277,11 +282,11 @@ def apply_change(morphology: Morphology, settings: Settings, change: Change) -> 
 
 
 def check_binding(morphology: Morphology, targets: Iterable[str], body: Iterable[str]) -> None:
-    """Check that the robot has these targets and these parts of the body, each named once.
+    """Check that the robot has these targets and parts of the body, each named once.
 
     Raises:
         UnknownName: If it lacks one; lists those it has.
-        BadValue: If there is no target, or a name stands twice.
+        BadValue: If there is no target, or a name occurs twice.
     """
     joints = [joint for arm in morphology.arms for joint in arm.joints]
     movable = (*morphology.command_space.names, *joints)

@@ -1,4 +1,4 @@
-"""Parameters of the retargeter; dataclasses only, so that a plugin can import them at once."""
+"""Configuration of the retargeter; imports no physics, so that plugins load quickly."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONSTRAINTS = ("upright",)
 
 @dataclass
 class RetargeterConfig:
-    """Which retargeter drives the robot, as set from the command line.
+    """Settings of the retargeter, as given on the command line.
 
     Attributes:
         type: `mpc`, or `direct` for the paper's direct-mapping baseline.
@@ -27,15 +27,15 @@ class RetargeterConfig:
         threads: Threads for the rollouts; 0 takes one per core.
         seed: Seed of the samples.
         preset: Settings to start with: `default`, `conservative`, `aggressive` or `table1`.
-        sync: Whether the measured state is put in accordance with the ground before each tick.
-        variant: Binding of targets to the body to start with, one that the robot names (RB-Y1:
-            `v1`, `v2`); empty takes its first.
-        targets: Tracked frames that the retargeter follows, with commas between; empty takes
+        sync: Whether to synchronise the measured state with the ground contacts before each tick.
+        variant: Initial binding of targets to the body, one that the robot names (RB-Y1: `v1`,
+            `v2`); empty takes its first.
+        targets: Tracked frames that the retargeter follows, separated by commas; empty takes those
+            of the variant.
+        body: Commands and arm joints that it may move for them, separated by commas; empty takes
             those of the variant.
-        body: What it may move for them: commands and arm joints, with commas between; empty
-            takes what the variant moves.
-        constraints: Constraints to start with, with commas between.
-        obstacles: YAML file of obstacles, which adds to what is fixed in the scene.
+        constraints: Initial constraints, separated by commas.
+        obstacles: YAML file of obstacles, in addition to those fixed in the scene.
     """
 
     type: str = "mpc"
@@ -68,7 +68,7 @@ class RetargeterConfig:
                 raise BadValue(f"{name} must not be negative, got {getattr(self, name)}")
 
     def override(self, config: MpcConfig) -> MpcConfig:
-        """Put what the user set into a robot's own parameters; zeros leave them."""
+        """Override a robot's own parameters by those that the user set; zeros keep them."""
         names = ("num_samples", "horizon", "control_hz")
         return replace(
             config, **{name: getattr(self, name) for name in names if getattr(self, name)}
@@ -76,10 +76,10 @@ class RetargeterConfig:
 
     @property
     def num_threads(self) -> int:
-        """Threads for the rollouts."""
+        """Number of threads for the rollouts."""
         return self.threads or len(os.sched_getaffinity(0))
 
 
 def split_names(text: str) -> tuple[str, ...]:
-    """Names of a list with commas between; none for an empty text."""
+    """Split a comma-separated list of names; empty for an empty text."""
     return tuple(name.strip() for name in text.split(",") if name.strip())

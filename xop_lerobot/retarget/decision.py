@@ -1,4 +1,4 @@
-"""What the controller may decide: the low-level command, and the targets of the arm joints."""
+"""Decision vector of the controller: the low-level command, then the arm joint targets."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arms.ik import ARM_MAX_RATE
 
 ARM_LAG_S = 0.1
-"""Time constant with which arm joints follow their targets, to first order [s]."""
+"""Time constant of the first-order lag with which arm joints follow their targets [s]."""
 ARM_EFFORT = 3.0
-"""How dear arm joints are to the kinematic proposal, away from their rest: they unwind in time."""
+"""Relative effort of arm joints in the kinematic proposal [1]; it unwinds them towards rest."""
 
 
 class DecisionSpace:
     r"""The decision vector :math:`u = (a, q_{arm})`: command entries, then all arm joints.
 
-    Which of them are free is the `body` that a target is bound to. The paper's Version 1 frees
-    the command alone, its Version 2 the torso and the left arm.
+    The free entries are the `body` that the targets are bound to: in the paper's Version 1 the
+    command, in its Version 2 the torso and the left arm.
 
     Args:
         morphology: The robot.
-        model: Its planning model; the joints' ranges bound the arm targets.
+        model: Its planning model; the joint ranges bound the arm targets.
 
     Attributes:
         space: Names, bounds and rates of the entries.
-        effects: What each entry does.
-        num_commands: How many of them are the command's.
+        effects: Effect of each entry.
+        num_commands: Number of command entries.
     """
 
     def __init__(self, morphology: Morphology, model: mujoco.MjModel) -> None:
@@ -50,10 +50,10 @@ class DecisionSpace:
         self.effects = (*morphology.effects, *arm_effects)
 
     def make_mask(self, body: tuple[str, ...]) -> np.ndarray:
-        """Which entries `body` names; all of the command for an empty one. Shape (n,), bool.
+        """Mask of the entries that `body` names; the whole command if empty. Shape (n,), bool.
 
         Raises:
-            UnknownName: If it names an entry that is not there; lists the known ones.
+            UnknownName: If an entry is unknown; lists the known ones.
         """
         mask = np.zeros(len(self.space), dtype=bool)
         for name in body or self.space.names[: self.num_commands]:
@@ -61,18 +61,18 @@ class DecisionSpace:
         return mask
 
     def join(self, command: np.ndarray, arms: np.ndarray) -> np.ndarray:
-        """Decision vector of a command and the arms' targets (grippers are left out). (n,)."""
+        """Decision vector of a command and arm targets, without the grippers. Shape (n,)."""
         return np.concatenate([command, arms[: len(self.joints)]])
 
     def split(
         self, decisions: np.ndarray, arms: np.ndarray, body: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Commands and arm targets of decisions; grippers stay as they are.
+        """Split decisions into commands and arm targets; grippers keep their targets.
 
         Args:
             decisions: Decisions. Shape (K, H, n).
-            arms: Arm and gripper targets now. Shape (m,).
-            body: Which entries are decided; without arms among them `arms` is what it is. (n,).
+            arms: Present arm and gripper targets. Shape (m,).
+            body: Mask of the free entries; without arm joints `arms` is returned as is. (n,).
 
         Returns:
             Commands, shape (K, H, k), and arm targets, shape (m,) or (K, H, m).

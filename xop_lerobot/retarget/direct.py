@@ -1,4 +1,4 @@
-"""The paper's baseline: direct mapping of the operator's head to commands, without prediction."""
+"""The paper's direct-mapping baseline: head pose and velocity to commands, without prediction."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ from xop_lerobot.retarget.plan import Plan, Retargeter
 
 
 class DirectRetargeter(Retargeter):
-    """Maps the head's height and orientation by kinematics, and its velocity as it is.
+    """Maps height and orientation of the head by kinematics, and its velocity unchanged.
 
-    Height and torso come from inverse kinematics of the goal's height and orientation, with the
-    base where it stands; the base's velocities are the head's own, along and across the head's
-    heading: who walks ahead makes the robot walk ahead, wherever the two look by now. Nothing
-    closes the loop on place or heading, so the robot drifts: that is what the baseline shows.
-    A heading that the waist has no part in, or cannot reach, is left to the yaw rate; else waist
-    roll and pitch would be bent for what is left of it.
+    Height and torso joints solve the inverse kinematics of the goal's height and orientation for
+    the present base pose. The base velocities are those of the operator's head, along and across
+    the head's heading: an operator who walks forward makes the robot walk forward, whatever their
+    headings in the world. Nothing closes the loop on position or heading, so the robot drifts, as
+    the baseline is meant to show. A heading that the waist does not control, or cannot reach, is
+    left to the yaw rate; otherwise waist roll and pitch would be bent to reduce the remaining
+    error.
 
     Args:
         morphology: The robot.
@@ -54,7 +55,7 @@ class DirectRetargeter(Retargeter):
         )
         self._turns_waist = find_joints_along(morphology, model, self.command_model, axis=2)
         self._last = self.space.neutral
-        self._drifted = 0.0  # heading that the waist had no part in when last in motion [rad]
+        self._drifted = 0.0  # goal heading out of the waist's range when last in mobile mode [rad]
 
     def control_period(self, mode: Mode) -> float:
         """Time between two plans [s]."""
@@ -66,12 +67,12 @@ class DirectRetargeter(Retargeter):
         self._last, self._drifted = state.command, 0.0
 
     def plan(self, state: RobotState, goal: Goal) -> Plan:
-        """Compute the command for `goal`; `state` gives the base's heading and place."""
+        """Compute the command for `goal`; of `state` only the base pose is used."""
         start = perf_counter()
         velocities = self.command_model.is_velocity()
         command = self._last
         if "head" in goal.poses:
-            # Long enough for the lags to die out: the mapping is static.
+            # The mapping is static: 2 s is long enough for the lags of the command model to decay.
             command = self.proposal.solve(
                 Start(state.qpos),
                 {"head": self._turn_to_base(state, goal)},
@@ -88,12 +89,12 @@ class DirectRetargeter(Retargeter):
         return Plan(command, command[None], goal.mode, timings={"solve": solve})
 
     def _turn_to_base(self, state: RobotState, goal: Goal) -> np.ndarray:
-        """The head's goal, turned about the vertical to where the waist can look. Shape (7,)."""
+        """The head's goal with its heading turned into the range of the waist. Shape (7,)."""
         pose, base = goal.poses["head"], float(quat_yaw(state.qpos[3:7]))
         beside = float(wrap_angle(compute_heading(pose[3:]) - base))
         waist = self._turns_waist & self.command_model.acting(goal.mode)
         low, high = self.space.low[waist].sum(), self.space.high[waist].sum()
-        if goal.mode is Mode.MOBILE:  # what the waist has no part in, the yaw rate has to do
+        if goal.mode is Mode.MOBILE:  # the yaw rate has to follow what exceeds the waist's range
             self._drifted = beside - float(np.clip(beside, low, high))
         beside = float(np.clip(wrap_angle(beside - self._drifted), low, high))
         wanted = base + beside
@@ -101,7 +102,7 @@ class DirectRetargeter(Retargeter):
         return make_pose(pose[:3], quat_multiply(quat_from_yaw(back), pose[3:]))
 
     def _map_velocity(self, state: RobotState, goal: Goal) -> np.ndarray:
-        """The head's velocity in its own heading, on the entries it belongs to. Shape (k,)."""
+        """Velocity of the head in its own heading, as base velocities of the command. (k,)."""
         velocity = goal.velocities.get("head", np.zeros(6))
         if goal.mode is Mode.STATIONARY or "head" not in goal.poses:
             return self.space.neutral

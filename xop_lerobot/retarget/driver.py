@@ -1,4 +1,4 @@
-"""The action of a tick: plan and arm kinematics, within the robot's limits."""
+"""The action of one control tick: plan and arm inverse kinematics, within the robot's limits."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.smoothing import CommandSmoother
 
 RETREAT_RATE = 1.0
-"""Speed at which arms in trouble go back to rest [rad/s]."""
+"""Speed at which arms return to their rest posture when the robot will not stand still [rad/s]."""
 
 
 class RobotDriver:
-    """Makes the actions that drive a robot, or hold it.
+    """Computes the actions that drive a robot or hold it in place.
 
-    `hold` or `drive` says what is wanted in a tick, `limit` what of it is executed.
+    Per tick, `hold` or `drive` gives the desired action, `limit` the one that is executed.
 
     Args:
         morphology: The robot.
         policy: Its low-level policy.
-        follower: Knows the plan that counts.
+        follower: Provides the plan in force.
         dt: Control period [s].
 
     Attributes:
-        arms: Follows the hands' goals by inverse kinematics.
+        arms: Inverse kinematics of the arms.
     """
 
     def __init__(
@@ -45,17 +45,17 @@ class RobotDriver:
         self._smoother = CommandSmoother(morphology.command_space, dt)
 
     def reset(self) -> None:
-        """Forget what was executed so far."""
+        """Forget the executed actions."""
         self._smoother.reset()
         self.arms.forget()
 
     def hold(self, state: RobotState, *, retreats: bool) -> RobotAction:
-        """Stand where and as the robot stands: velocities stop, the posture stays.
+        """Hold in place: velocities stop, the posture stays.
 
         Args:
-            state: The robot now.
-            retreats: Whether the arms go back to rest, slowly. If a robot moves that should stand,
-                they are the cause: there are postures in which a low-level policy walks off.
+            state: Present state of the robot.
+            retreats: Whether the arms slowly return to their rest posture. If a holding robot
+                moves, they are the cause: in some arm postures a low-level policy walks off.
         """
         command = self._morphology.command_space.compute_rest(state.command, state.mode)
         arms = state.arms
@@ -68,9 +68,9 @@ class RobotDriver:
         """Follow the goal by plan and arm kinematics.
 
         Args:
-            state: The robot now.
-            goal: Where it should go.
-            head: Pose of its head. Shape (7,).
+            state: Present state of the robot.
+            goal: Present goal.
+            head: Pose of the robot's head. Shape (7,).
             dt: Time since the last tick [s].
         """
         self._follower.update(state, goal)
@@ -85,7 +85,7 @@ class RobotDriver:
         return RobotAction(command, goal.mode, arms)
 
     def limit(self, state: RobotState, wanted: RobotAction) -> RobotAction:
-        """What the robot will execute: bounds, rates and changes of rate, as it limits too."""
+        """Limit an action to bounds, rates and accelerations; the robot applies the same limits."""
         command, mode = self._smoother.smooth(
             wanted.command, wanted.mode, state.command, state.mode
         )

@@ -1,4 +1,4 @@
-"""Makes the retargeter that a configuration names."""
+"""Factory of the retargeter that a configuration names, and of the obstacles that it avoids."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ logger = logging.getLogger(__name__)
 
 
 def explain_blindness(kind: str, morphology: Morphology) -> str:
-    """Say why a robot that is retargeted so keeps clear of nothing; empty if it does.
+    """Reason why this retargeter and robot ignore obstacles; empty if they avoid them.
 
     Args:
         kind: Type of the retargeter.
         morphology: The robot.
     """
     if kind != "mpc":
-        return f"retargeter {kind!r} keeps clear of nothing. Retargeters that do: mpc"
+        return f"retargeter {kind!r} does not avoid obstacles. Retargeters that do: mpc"
     if not morphology.hull_points:
-        seeing = [name for name in MORPHOLOGIES if make_morphology(name).hull_points]
+        able = [name for name in MORPHOLOGIES if make_morphology(name).hull_points]
         return (
-            f"robot {morphology.name!r} keeps clear of nothing. Robots that do: {', '.join(seeing)}"
+            f"robot {morphology.name!r} does not avoid obstacles. Robots that do: {', '.join(able)}"
         )
     return ""
 
 
 def check_obstacles(config: RetargeterConfig, morphology: Morphology) -> None:
-    """Check that a file of obstacles, if there is one, is heeded.
+    """Check that an obstacle file, if one is given, is not ignored.
 
     Raises:
-        BadValue: If it would be ignored, with what would heed it.
+        BadValue: If robot or retargeter would ignore it; names those that would not.
     """
     reason = explain_blindness(config.type, morphology) if config.obstacles else ""
     if reason:
@@ -53,7 +53,7 @@ def check_obstacles(config: RetargeterConfig, morphology: Morphology) -> None:
 
 
 def warn_of_scene(kind: str, morphology: Morphology, scene: str) -> None:
-    """Warn, once, where what is fixed in a scene is no part of any plan.
+    """Warn, once, if the planner ignores the fixed obstacles of a scene.
 
     Args:
         kind: Type of the retargeter.
@@ -65,16 +65,16 @@ def warn_of_scene(kind: str, morphology: Morphology, scene: str) -> None:
 
 
 def warn_of_obstacles(kind: str, morphology: Morphology, scene: str, count: int) -> None:
-    """Warn, once, where so many obstacles in a scene are no part of any plan."""
+    """Warn, once, if the planner ignores the `count` obstacles of a scene."""
     reason = explain_blindness(kind, morphology)
     if reason and count:
         _warn_once(f"{say_count(count, 'obstacle')} in scene {scene!r} ignored: {reason}.")
 
 
 def find_obstacles(morphology: Morphology, scene: str) -> tuple[Obstacle, ...] | None:
-    """Walls and furniture of a scene, None for a robot that keeps clear of nothing.
+    """Walls and furniture of a scene; None for a robot that does not avoid obstacles.
 
-    The planning model holds the floor alone, so they come from the full one.
+    They are read from the full model: the planning model contains only the floor.
     """
     if not morphology.hull_points:
         return None
@@ -87,9 +87,9 @@ def gather_obstacles(
     scene: str,
     obstacles: tuple[Obstacle, ...],
 ) -> tuple[Obstacle, ...] | None:
-    """Add those of the file of obstacles to `obstacles`; None if the robot keeps clear of nothing.
+    """Add the obstacles of the configured file; None for a robot that does not avoid obstacles.
 
-    Warns, once, where they are no part of any plan.
+    Warns, once, if the planner ignores them.
     """
     warn_of_obstacles(config.type, morphology, scene, len(obstacles))
     if not morphology.hull_points:
@@ -117,15 +117,15 @@ def make_retargeter(
     """Make the retargeter `config.type` (checked when the configuration was made).
 
     Args:
-        config: Its settings; a file of obstacles adds to the others.
+        config: Its settings; obstacles of a file add to the others.
         morphology: The robot.
         policy: Its low-level policy.
         model: Its planning model.
-        obstacles: What stands around it; by default what is fixed in `model`.
+        obstacles: Obstacles around the robot; by default the geoms that are fixed in `model`.
 
     Raises:
-        BadObstacles: If the file of obstacles is missing or malformed.
-        BadValue: If there is one, and robot or retargeter would ignore it.
+        BadObstacles: If the obstacle file is missing or malformed.
+        BadValue: If there is one, but robot or retargeter would ignore it.
     """
     check_obstacles(config, morphology)
     if config.type == "direct":
@@ -144,7 +144,7 @@ def apply_settings(
     config: RetargeterConfig,
     settings: Settings,
 ) -> None:
-    """Give a planner the settings that are in force, from its next solve on."""
+    """Apply the settings in force to a planner, from its next solve on."""
     planner.configure(
         configs=build_configs(morphology, config, settings),
         targets=settings.targets,

@@ -1,4 +1,4 @@
-"""Goals over the horizon: held within reach, and carried on at their velocity."""
+"""Goal poses over the horizon: limited in distance, levelled, extrapolated at their velocity."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from xop_lerobot.retarget.costs.tracking import make_level
 
 
 def hold_near(goal: Goal, poses: Mapping[str, np.ndarray], reach: float) -> Goal:
-    """Move goals that are further than `reach` aside of their frame up to that distance.
+    """Limit the horizontal distance of goals from their frames to `reach`.
 
-    A goal metres away must not bend the robot towards it; walking there is another matter.
+    A larger error would only make the robot lean towards a goal that it has to walk to.
 
     Args:
         goal: The goal.
-        poses: Where the frames are that are to be followed. Shapes (7,).
+        poses: Present pose of each frame to follow. Shapes (7,).
         reach: Largest horizontal distance [m].
     """
     near = dict(goal.poses)
@@ -34,9 +34,9 @@ def hold_near(goal: Goal, poses: Mapping[str, np.ndarray], reach: float) -> Goal
 
 
 def hold_level(goal: Goal, frames: Iterable[str]) -> Goal:
-    """Turn the goals of `frames` so that they are level, and only turn about the vertical.
+    """Level the goals of `frames`; their angular velocity keeps only its vertical component.
 
-    A tilt that is not to be followed shall not compete with the constraint that forbids it.
+    The tilt of the operator's hand would compete with the constraint that keeps the hand level.
     """
     poses, velocities = dict(goal.poses), dict(goal.velocities)
     for name in frames:
@@ -56,7 +56,7 @@ def preview(
         goal: The goal now, with its velocities.
         frames: Tracked frames; those without a goal are left out.
         ahead: Times from now [s]. Shape (n,).
-        preview_s: Time after which a goal is assumed to stand still [s].
+        preview_s: Time after which a goal is assumed to be stationary [s].
 
     Returns:
         Poses. Shapes (n, 7).
@@ -75,10 +75,10 @@ def preview(
 
 
 def carry_on(pose: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> np.ndarray:
-    r"""Carry a pose on at a velocity: :math:`p + v t,\ e^{\omega t/2} \circ q`.
+    r"""Extrapolate a pose at constant velocity: :math:`p + v t,\ e^{\omega t/2} \circ q`.
 
-    About an axis n that stays, :math:`e^{n\alpha/2} \circ q = \cos\frac\alpha2\,q +
-    \sin\frac\alpha2\,(n \circ q)`: one product for all times.
+    For a constant axis n, :math:`e^{n\alpha/2} \circ q = \cos\frac\alpha2\,q +
+    \sin\frac\alpha2\,(n \circ q)`: one quaternion product serves all times.
 
     Args:
         pose: Pose at t = 0. Shape (7,).

@@ -1,7 +1,7 @@
-"""KMPPI: model predictive path integral control over kernel-interpolated support points.
+"""KMPPI: model predictive path integral control with kernel-interpolated support points.
 
-The file has what KMPPI consists of: the weights of samples from their costs, the noise, and the
-optimizer.
+`Kmppi` is the optimizer; `compute_weights` turns costs into weights, and `DRAWS` are the kinds of
+sampling noise. With the default of one support point it is MPPI over a single held command.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from xop_lerobot.core.errors import BadShape
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.optimizer import Samples, SamplingOptimizer
 
-_TOLERANCE = 1e-6  # of the logarithm of the effective sample size
-_LEAST_SPAN = 1e-290  # costs nearer to each other than that are the same
+_TOLERANCE = 1e-6  # error of the logarithm of the effective sample size
+_LEAST_SPAN = 1e-290  # differences of costs below this count as ties (log and division stay finite)
 _MAX_ITERATIONS = 100
 
 
 def compute_weights(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
     r"""Weights :math:`w_i \propto \exp(-(J_i - \min J)/\lambda)` that sum to one.
 
-    `raw` takes λ in units of the cost; `ess` finds the λ at which the effective sample size
-    :math:`1/\sum w_i^2` is the wanted one, which makes the update independent of the scale of the
-    cost. Samples whose cost is not finite get none.
+    `raw` takes λ from `config`, in units of the cost; `ess` finds the λ that gives the desired
+    effective sample size :math:`1/\sum w_i^2`, which makes the update independent of the scale of
+    the cost. Samples with a non-finite cost get zero weight.
 
     Args:
         costs: Total cost of each sample. Shape (K,).
         config: Weighting and its parameters.
 
     Returns:
-        Weights. Shape (K,). All on the first sample (the standing plan) if no cost is finite.
+        Weights. Shape (K,). All on the first sample (the shifted plan) if no cost is finite.
     """
-    if math.isfinite(costs.dot(costs)):  # so they all are, in one look
+    if math.isfinite(costs.dot(costs)):  # then all are finite; one product is the fastest check
         return _weigh_finite(costs, config)
     weights, finite = np.zeros(len(costs)), np.isfinite(costs)
     if finite.any():
@@ -54,13 +54,13 @@ def _weigh_finite(costs: np.ndarray, config: MpcConfig) -> np.ndarray:
 
 
 def _compute_ess_weights(excess: np.ndarray, wanted: float) -> np.ndarray:
-    r"""Weights of the wanted effective sample size; those alike that tie, if more tie for best.
+    r"""Weights of the desired effective sample size; equal if at least as many tie for the best.
 
     Newton's method for :math:`f(s) = \log n(e^s) - \log n^*` with the sample size
     :math:`n(\lambda) = (\sum e_i)^2 / \sum e_i^2`, :math:`e_i = \exp(-x_i/\lambda)`, whose
     derivative :math:`f' = \frac{2}{\lambda}(\frac{\sum x_i e_i}{\sum e_i} -
-    \frac{\sum x_i e_i^2}{\sum e_i^2})` is never negative; a step out of the bracket halves
-    it instead. The bracket is in units of the n-th best, so that no bad sample widens it.
+    \frac{\sum x_i e_i^2}{\sum e_i^2})` is never negative; a step out of the bracket is replaced
+    by bisection. The bracket scales with the n*-th best cost, so that outliers do not widen it.
     """
     count = len(excess)
     wanted = min(wanted, 0.99 * count)
@@ -69,7 +69,7 @@ def _compute_ess_weights(excess: np.ndarray, wanted: float) -> np.ndarray:
     if nth_best < _LEAST_SPAN:
         tied = excess < _LEAST_SPAN
         return tied / tied.sum()
-    position = math.log(0.65 * nth_best)  # the answer for most spreads of costs
+    position = math.log(0.65 * nth_best)  # initial guess: near the solution for most cost spreads
     low, high = position - 60.0, position + 60.0
     target = math.log(wanted)
     powers, basis = np.empty((2, count)), np.empty((2, count))  # e and e²; 1 and x
@@ -102,7 +102,7 @@ def compute_effective_samples(weights: np.ndarray) -> float:
 
 
 Draw = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
-"""(rng, shape) -> standard normal values; the first axis counts the samples."""
+"""(rng, shape) -> standard normal values; the first axis indexes the samples."""
 
 
 def draw_gaussian(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -111,7 +111,7 @@ def draw_gaussian(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarra
 
 
 def draw_antithetic(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Draw pairs of opposite samples: the mean of an even number is zero."""
+    """Draw antithetic pairs ±ε, so that the mean of an even number of samples is zero."""
     first = rng.standard_normal(((shape[0] + 1) // 2, *shape[1:]))
     return np.concatenate([first, -first])[: shape[0]]
 
@@ -121,7 +121,7 @@ DRAWS: dict[str, Draw] = {"gaussian": draw_gaussian, "antithetic": draw_antithet
 
 __all__ = ["Kmppi", "Samples", "compute_effective_samples", "compute_weights"]
 
-_MAX_SHIFTS = 64
+_MAX_SHIFTS = 64  # shift matrices that are cached
 
 
 class Kmppi(SamplingOptimizer):
@@ -132,14 +132,14 @@ class Kmppi(SamplingOptimizer):
 
     .. math:: A(t) = \theta_S + k(t, t_k)\,k(t_k, t_k)^{-1}(\theta - \theta_S).
 
-    A steady command is thus represented exactly, and survives the shift from plan to plan;
-    with the zero mean of the original (`kernel_mean="zero"`) it leaks towards zero within a few
-    plans. Samples :math:`\theta + \epsilon` are clipped to the bounds, before and after the
-    interpolation; the plan becomes their weighted mean.
+    A constant command is thus represented exactly and survives the shift from plan to plan; with
+    the original's zero mean (`kernel_mean="zero"`) it decays towards zero within a few plans.
+    Samples :math:`\theta + \epsilon` are clipped to the bounds before and after the interpolation;
+    the plan becomes their weighted mean.
 
     With `kernel_mean="zero", shift="one", sampling="gaussian", sample_plan=False,
-    weighting="raw", importance_cost=True` and no candidates it does what KMPPI of pytorch_mppi
-    0.9.1 does, to rounding.
+    weighting="raw", importance_cost=True` and no candidates it equals KMPPI of pytorch_mppi 0.9.1
+    up to rounding.
 
     Args:
         horizon: Number of control steps T.
@@ -156,7 +156,7 @@ class Kmppi(SamplingOptimizer):
         self._interpolation = self._compute_interpolation(np.arange(horizon))
         self._shifts: dict[float, np.ndarray] = {}
         self._moved: np.ndarray | None = None
-        # One value held over the horizon, or one at every step, needs no interpolation.
+        # One value held over the horizon, or one value per step, needs no interpolation.
         self._constant = num_knots == 1 and config.kernel_mean == "hold"
         self._direct = self._constant or num_knots == horizon
         self._low, self._high = self.low[:, None], self.high[:, None]
@@ -172,7 +172,7 @@ class Kmppi(SamplingOptimizer):
             kernel(self.knot_times, self.knot_times), kernel(times, self.knot_times).T
         ).T
         if self.config.kernel_mean == "hold":
-            gain[:, -1] += 1 - gain.sum(axis=1)  # the mean: what is left of the last value
+            gain[:, -1] += 1 - gain.sum(axis=1)  # the mean θ_S: rows must sum to one
         return gain
 
     def reset(self, command: np.ndarray) -> None:
@@ -184,10 +184,10 @@ class Kmppi(SamplingOptimizer):
 
     @property
     def nominal(self) -> np.ndarray:
-        """The planned sequence before the bounds. Shape (T, k)."""
+        """The planned sequence before clipping. Shape (T, k)."""
         if self._moved is not None:
             return self._moved.copy()
-        return self._interpolation.dot(self.knots)  # faster than @ where arrays are small
+        return self._interpolation.dot(self.knots)  # faster than @ for small arrays
 
     @property
     def commands(self) -> np.ndarray:
@@ -195,10 +195,11 @@ class Kmppi(SamplingOptimizer):
         return np.minimum(np.maximum(self.nominal, self.low), self.high)
 
     def shift(self, steps: float) -> None:
-        """Move the plan on by `steps` control steps.
+        """Advance the plan by `steps` control steps.
 
-        Past its end the last value is held, or, with a kernel of zero mean, fades; until the
-        next update the original then has the old sequence moved on by whole steps, and zeros.
+        Beyond its end the last value is held or, with a zero-mean kernel, decays. As in the
+        original, the zero-mean plan until the next update is the old sequence shifted by whole
+        steps and padded with zeros.
         """
         if self._constant:
             return
@@ -212,14 +213,14 @@ class Kmppi(SamplingOptimizer):
         self.knots = self._get_shift(steps).dot(self.knots)
 
     def _get_shift(self, steps: float) -> np.ndarray:
-        """Matrix that moves the support values on by `steps`. Shape (S, S)."""
+        """Matrix that advances the support values by `steps`. Shape (S, S)."""
         key = round(min(steps, 1e6), 6)
         matrix = self._shifts.get(key)
         if matrix is None:
             times = self.knot_times + key
             if self.config.kernel_mean == "hold":
                 times = np.minimum(times, self.horizon - 1)
-            if len(self._shifts) >= _MAX_SHIFTS:  # measured times differ for ever
+            if len(self._shifts) >= _MAX_SHIFTS:  # measured times never repeat: bound the cache
                 self._shifts.clear()
             matrix = self._shifts[key] = self._compute_interpolation(times)
         return matrix
@@ -232,17 +233,20 @@ class Kmppi(SamplingOptimizer):
         Args:
             rng: Source of randomness.
             noise_std: Standard deviation of every entry. Shape (k,), or (S, k).
-            candidates: Commands to try held over the horizon. Shape (c, k).
+            candidates: Fixed commands, each held over the horizon. Shape (c, k).
 
         Returns:
             K samples within the bounds.
+
+        Raises:
+            BadShape: If `noise_std` or `candidates` does not fit.
         """
         total, (num_knots, entries) = self.config.num_samples, self.knots.shape
         if noise_std.shape not in ((entries,), (num_knots, entries)):
             raise BadShape("noise_std", (entries,), noise_std.shape)
         if candidates.ndim != 2 or candidates.shape[1] != entries:
             raise BadShape("candidates", f"(c, {entries})", candidates.shape)
-        knots = np.empty((num_knots, entries, total))  # samples last: long inner loops
+        knots = np.empty((num_knots, entries, total))  # samples last: the longest axis inside
         fixed = int(self.config.sample_plan)
         if fixed:
             knots[..., 0] = self.knots
@@ -280,20 +284,24 @@ class Kmppi(SamplingOptimizer):
         r"""MPPI's importance sampling: :math:`\lambda\sum_t U_t^\top\Sigma^{-1}(A_t-U_t)`. (K,)."""
         nominal = self.nominal
         variance = np.square(noise_std if noise_std.ndim == 1 else noise_std[0])
-        # An entry without noise has no density; it costs nothing.
+        # An entry without noise has no density and contributes nothing.
         precision = np.divide(1.0, variance, where=variance > 0, out=np.zeros_like(variance))
         gain = self.config.temperature * nominal * precision
         deviation = commands - nominal[..., None]
         return gain.ravel().dot(deviation.reshape(gain.size, -1))
 
     def update(self, samples: Samples, costs: np.ndarray) -> np.ndarray:
-        """Move the plan to the weighted mean of the samples. Returns the weights, shape (K,)."""
+        """Set the plan to the weighted mean of the samples. Returns the weights, shape (K,).
+
+        Raises:
+            BadShape: If there is not one cost per sample.
+        """
         if costs.shape != (len(samples.knots),):
             raise BadShape("costs", (len(samples.knots),), costs.shape)
         weights = self._weigh(costs if samples.penalty is None else costs + samples.penalty)
         rows = samples.knots.transpose(1, 2, 0).reshape(-1, len(weights))
         mean = rows.dot(weights)
-        if not math.isfinite(mean.dot(mean)):  # a sample that is not finite got in with weight 0
+        if not math.isfinite(mean.dot(mean)):  # a non-finite sample of weight 0: 0 · inf is NaN
             used = weights > 0
             mean = rows[:, used].dot(weights[used])
         self.knots, self._moved = mean.reshape(self.knots.shape), None

@@ -1,4 +1,9 @@
-"""The model predictive controller: KMPPI over MuJoCo with the low-level policy in the loop."""
+"""Model predictive controller: KMPPI over MuJoCo rollouts with the low-level policy in the loop.
+
+`MpcRetargeter` solves Eq. 1 once per call of `plan`. The parts of a solve are in `references.py`
+(reference trajectory), `candidates.py` (analytic proposal, verdict), `kmppi.py` (sampling and
+update) and `problem.py` (dynamics and cost).
+"""
 
 from __future__ import annotations
 
@@ -33,11 +38,11 @@ from xop_lerobot.retarget.rollout import Prediction
 
 @dataclass(frozen=True)
 class _Planner:
-    """The plan of one mode, and how it is improved.
+    """Optimizer of one mode; it holds the current plan.
 
     Attributes:
-        optimizer: Holds the plan.
-        noise_std: Standard deviation of the samples, by entry. Shape (n,).
+        optimizer: The sampling optimizer.
+        noise_std: Standard deviation of the sampling noise per decision entry. Shape (n,).
     """
 
     optimizer: SamplingOptimizer
@@ -47,10 +52,11 @@ class _Planner:
 class MpcRetargeter(Retargeter):
     r"""Solves Eq. 1: :math:`\min_{a_0 \dots a_{H-1}} \sum_k l(x_k, a_k, G) + V_f(x_H, G)`.
 
-    Each solve shifts the last plan by the time that has passed, adds fixed candidates (the
-    kinematic proposal, the command being executed, a stop) to samples around it, rolls all out
-    in MuJoCo with the low-level policy and its memory in the loop, and moves the plan to the
-    weighted mean. `configure` changes settings between two solves, from any thread.
+    Each solve shifts the last plan by the elapsed time, adds fixed candidates (kinematic proposal,
+    executed command, stop) to noisy samples around it, rolls all of them out in MuJoCo with the
+    low-level policy and its memory in the loop, and moves the plan to their weighted mean.
+    `configure` and `set_obstacles` may be called from any thread; they take effect at the next
+    solve.
 
     Args:
         morphology: The robot.
@@ -58,7 +64,7 @@ class MpcRetargeter(Retargeter):
         model: Its planning model in the scene.
         config: Settings; zeros take the robot's own parameters.
         targets: Tracked frames to follow; None takes those of `config`.
-        obstacles: What to keep clear of; by default what is fixed in `model`.
+        obstacles: Obstacles to avoid; by default the geoms that are fixed in `model`.
     """
 
     def __init__(
@@ -78,8 +84,8 @@ class MpcRetargeter(Retargeter):
             model, self.space, self.decision.effects, morphology.pivot, morphology.rest
         )
         self.drift = DriftObserver(self.command_model, lag_s=morphology.velocity_lag_s)
-        # A servo at its limit may be far from its command, and the rest of the torso has to know;
-        # a policy that is far from it is on its way.
+        # A torque-limited servo can rest far from its command, and the other joints must then
+        # compensate; a policy far from its command is usually still moving, so its bound is small.
         largest = morphology.largest_offset
         self.offset = OffsetObserver(self.command_model, largest=largest)
         self.problem = Problem(
@@ -130,18 +136,18 @@ class MpcRetargeter(Retargeter):
         body: tuple[str, ...] | None = None,
         constraints: frozenset[str] | None = None,
     ) -> None:
-        """Change settings from the next solve on; None leaves them. All or nothing.
+        """Change settings from the next solve on; None keeps a setting. All or nothing.
 
-        The plan goes on: other weights or samples move it, and the rate limits hold.
+        The current plan is kept as the starting point, so the command does not jump.
 
         Args:
             configs: Parameters of the modes that change.
             targets: Tracked frames to follow.
-            body: Commands and arm joints that may be moved for them; empty: all commands.
-            constraints: Constraints that hold, such as ``"upright"``.
+            body: Commands and arm joints that may move for them; empty for all commands.
+            constraints: Active constraints, such as ``"upright"``.
 
         Raises:
-            UnknownName: If a target, an entry or a constraint is not known; lists those that are.
+            UnknownName: If a target, entry or constraint is unknown; lists the known ones.
         """
         with self._lock:
             frames = self.morphology.frames
@@ -169,11 +175,12 @@ class MpcRetargeter(Retargeter):
             self.candidates.configure(new, sites, bool(upright))
 
     def _make_planner(self, mode: Mode, config: MpcConfig) -> _Planner:
-        """A planner for `config`: one that goes on with the present plan where that fits."""
+        """Make a planner for `config` that starts from the present plan."""
         noise = np.zeros(len(self.space))
         for name, value in config.noise_std.items():
-            noise[self.space.index(name)] = value  # a misspelt name must not mean no noise
+            noise[self.space.index(name)] = value  # raises for a misspelt name
         old = self._planners.get(mode)
+        # The optimizer does not depend on the cost weights: keep it, with its plan as it is.
         if old is not None and replace(self.configs[mode], weights=config.weights) == config:
             return _Planner(old.optimizer, noise)
         optimizer = build_optimizer(config.horizon, self.space.low, self.space.high, config)
@@ -182,7 +189,7 @@ class MpcRetargeter(Retargeter):
         return _Planner(optimizer, noise)
 
     def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Keep clear of these and no others from the next solve on."""
+        """Replace the obstacles to avoid, from the next solve on."""
         with self._lock:
             self.problem.set_obstacles(obstacles)
             self.references.set_obstacles(obstacles)
@@ -192,11 +199,11 @@ class MpcRetargeter(Retargeter):
         return 1 / self.configs[mode].control_hz
 
     def close(self) -> None:
-        """Stop the threads."""
+        """Stop the threads of the rollouts."""
         self.rollout.close()
 
     def reset(self, state: RobotState) -> None:
-        """Start anew from the command that `state` executes, with the seed's first samples."""
+        """Restart from the command that `state` executes, with a freshly seeded generator."""
         with self._lock:
             self._rng = np.random.default_rng(self._seed)
             self._last = None
@@ -220,13 +227,13 @@ class MpcRetargeter(Retargeter):
         now = self._observe(state, mode, config)
         self._warm_start(now, mode)
 
-        # What is to be followed, and the analytic answer to it.
+        # Reference trajectory, and the analytic solution for it.
         reference = self.references.lead(now, goal, config)
         proposal = self.candidates.propose(now, reference, mode, config, optimizer.commands[0])
         proposal = self._hold(proposal, now, mode)
         reference = self.references.detour(reference, now, proposal, mode, config)
 
-        # The plan, that answer and others, and noise around the plan.
+        # Samples: the shifted plan, the fixed candidates, and noise around the plan.
         candidates = self.candidates.collect(state, goal, now, proposal, config)
         share = reference.compute_noise_share(now.poses, config)
         noise = planner.noise_std * self.command_model.acting(mode) * share
@@ -234,15 +241,15 @@ class MpcRetargeter(Retargeter):
         commands = self.problem.restrict(self._hold(samples.commands, now, mode), mode)
         sampled = perf_counter()
 
-        # What they do and what that costs: Eqs. 1b, 1c and 1a.
+        # Dynamics (Eqs. 1b, 1c) and cost (Eq. 1a) of the samples.
         prediction = self.problem.predict(state, now, commands, mode)
         rolled = perf_counter()
         scores = self.problem.score(
             self.problem.evaluate(prediction, commands, now, reference, proposal, mode, config)
         )
-        weights = optimizer.update(samples, scores.costs)  # which adds the samples' own penalty
+        weights = optimizer.update(samples, scores.costs)  # adds the samples' own penalty
 
-        # The mean is executed unless it is likely to fail.
+        # Execute the weighted mean unless it is likely to fall or collide.
         stop = _find_stop(config, len(commands))
         verdict = judge(weights, scores.costs, scores.falls, scores.touches, stop)
         self._apply(verdict, optimizer, samples.commands, now)
@@ -260,7 +267,7 @@ class MpcRetargeter(Retargeter):
         return self._make_plan(planned, prediction, scores, weights, verdict, mode, timings)
 
     def _observe(self, state: RobotState, mode: Mode, config: MpcConfig) -> PlannerState:
-        """Where the robot is, and what it does beside its command."""
+        """Update the observers; returns the state that all parts of the solve start from."""
         executed = self.decision.join(state.command, state.arms)
         observes = config.observe_drift
         self.drift.update(state.time, state.qpos, executed, observes and mode is Mode.MOBILE)
@@ -276,7 +283,7 @@ class MpcRetargeter(Retargeter):
         )
 
     def _warm_start(self, now: PlannerState, mode: Mode) -> None:
-        """Shift the last plan by the time that has passed, or start from the executed command."""
+        """Shift the last plan by the elapsed time; after a change of mode hold the command."""
         optimizer = self._planners[mode].optimizer
         if self._last is None or self._last[1] is not mode:
             optimizer.reset(self._hold(now.executed, now, mode))
@@ -284,7 +291,7 @@ class MpcRetargeter(Retargeter):
             optimizer.shift(max(0.0, now.time - self._last[0]) / POLICY_DT)
 
     def _hold(self, decisions: np.ndarray, now: PlannerState, mode: Mode) -> np.ndarray:
-        """Decisions, with what is not decided as it is. (..., n) -> (..., n)."""
+        """Set entries that are not decision variables to their held value. (..., n)."""
         return self.command_model.hold(decisions, now.executed, mode)
 
     def _apply(
@@ -294,7 +301,7 @@ class MpcRetargeter(Retargeter):
         commands: np.ndarray,
         now: PlannerState,
     ) -> None:
-        """Change the plan by the verdict on it; `commands` are the samples', (K, H, n)."""
+        """Apply an intervention to the plan; `commands` are those of the samples, (K, H, n)."""
         if verdict.sample is not None:
             optimizer.reset(commands[verdict.sample, 0])
         elif verdict.scale < 1.0:
@@ -312,7 +319,7 @@ class MpcRetargeter(Retargeter):
         mode: Mode,
         timings: Mapping[str, float],
     ) -> Plan:
-        """The answer: the planned decisions, (H, n), and what the cheapest sample does."""
+        """Make the `Plan` of decisions (H, n), with the prediction of the cheapest sample."""
         finite = np.isfinite(scores.costs)
         best = int(np.argmin(np.where(finite, scores.costs, np.inf)))
         names, count = self.space.names, self.decision.num_commands
@@ -333,7 +340,7 @@ class MpcRetargeter(Retargeter):
 
 
 def _find_stop(config: MpcConfig, num_samples: int) -> int | None:
-    """Index of the sample that stops: candidates follow the plan. None without one."""
+    """Index of the `stop` candidate among the samples; None without one."""
     if "stop" not in config.candidates:
         return None
     stop = config.sample_plan + config.candidates.index("stop")

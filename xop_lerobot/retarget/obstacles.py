@@ -1,4 +1,4 @@
-"""Obstacles: from the scene or a YAML file, and exact distances to all of them at once."""
+"""Static obstacles of a scene or a YAML file, and batched exact distances to all of them."""
 
 from __future__ import annotations
 
@@ -26,16 +26,20 @@ _GROUND = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A solid that stands still.
+    """A static solid.
 
     Attributes:
         name: Its name.
         position: Centre in the world [m]. Shape (3,).
         quat: Orientation wxyz; cylinders and capsules lie along their Z. Shape (4,).
-        half_size: Half the edges of the box around it, along its own axes [m]: of a cylinder
-            r, r, l/2, and the caps of a capsule belong to its length. Shape (3,).
+        half_size: Half the edges of its bounding box along its own axes [m]: r, r, l/2 for a
+            cylinder; the length of a capsule includes its caps. Shape (3,).
         shape: One of `SHAPES`.
-        handled: Whether hands work at it, or closely beside it, and need not keep clear of it.
+        handled: Whether hands work at it or close to it, and need not avoid it.
+
+    Raises:
+        UnknownName: If the shape is unknown.
+        BadValue: If a size is not positive.
     """
 
     name: str
@@ -54,7 +58,7 @@ class Obstacle:
     def compute_distance(self, points: np.ndarray) -> np.ndarray:
         """Signed distance of points to the surface, negative inside [m]. (..., 3) -> (...).
 
-        The plain formula of each shape; `ObstacleSet` does the same for many at once.
+        The plain formula of each shape; `ObstacleSet` computes the same for many obstacles.
         """
         local = np.abs(quat_rotate(quat_conjugate(self.quat), points - self.position))
         radius, half = self.half_size[0], self.half_size[2]
@@ -73,14 +77,14 @@ class Obstacle:
 
 
 class ObstacleSet:
-    r"""Signed distances of many points to many obstacles in one pass, with no loop over either.
+    r"""Signed distances of many points to many obstacles in one vectorised pass.
 
     With :math:`q = |R_j^\top(p - c_j)|`, for a cylinder :math:`q = (\sqrt{q_x^2 + q_y^2}, 0, q_z)`,
     every shape is a core of half sizes :math:`h_j`, rounded by :math:`r_j`:
 
     .. math:: d_j(p) = \|\max(q - h_j, 0)\| + \min(\max_i(q - h_j)_i, 0) - r_j.
 
-    A sphere has a point for its core, a capsule a line, box and cylinder are not rounded.
+    The core of a sphere is a point, that of a capsule a line; box and cylinder have r_j = 0.
 
     Args:
         obstacles: The obstacles.
@@ -95,27 +99,28 @@ class ObstacleSet:
         self._radii = np.array([row[3] for row in rows])
         self._round = np.array([each.shape == "cylinder" for each in self.obstacles], dtype=bool)
         self.handled = np.array([each.handled for each in self.obstacles], dtype=bool)
-        """Which of them hands work at. Shape (J,)."""
+        """Which obstacles the hands work at. Shape (J,), bool."""
 
     def __len__(self) -> int:
         return len(self.obstacles)
 
     def find_near(self, points: np.ndarray, distance: float) -> np.ndarray:
-        """Obstacles that any of `points` may be nearer to than `distance` [m].
+        """Obstacles to which any of `points` may be closer than `distance` (conservative).
 
-        A distance changes by no more than the point moves; so those farther from the middle of
-        the points than `distance` and the farthest point are out of question.
+        A signed distance changes by no more than the point moves (Lipschitz constant 1), so an
+        obstacle farther from the centre of the points' bounding box than `distance` plus half its
+        diagonal cannot be close to any of them.
 
         Args:
             points: Points. Shape (..., 3).
-            distance: How near [m].
+            distance: Distance threshold [m].
 
         Returns:
-            Their indices. Shape (n,).
+            Indices of the obstacles. Shape (n,).
         """
         flat = points.reshape(-1, 3)
         low, high = flat.min(axis=0), flat.max(axis=0)
-        if not np.isfinite(low + high).all():  # a sample that diverged
+        if not np.isfinite(low + high).all():  # a diverged sample: cull nothing
             return np.arange(len(self))
         spread = float(np.linalg.norm(high - low)) / 2
         return np.flatnonzero(self.compute_distances((low + high) / 2) < distance + spread)
@@ -132,7 +137,7 @@ class ObstacleSet:
         """
         which = np.arange(len(self)) if which is None else which
         axes, cores = self._axes[which], self._cores[which]
-        # Components come first, points last: every pass is over contiguous numbers.
+        # Components first, points last: every pass is over contiguous memory.
         turned = np.einsum("jab->bja", axes).reshape(-1, 3) @ points.reshape(-1, 3).T
         local = turned.reshape(3, len(which), points[..., 0].size)
         local -= np.einsum("jab,ja->bj", axes, self._centres[which])[..., None]
@@ -158,7 +163,7 @@ def _make_row(obstacle: Obstacle) -> tuple[np.ndarray, np.ndarray, np.ndarray, f
         radius = float(half[0])
         half = np.array([0.0, 0, half[2] - radius])
     elif obstacle.shape == "cylinder":
-        half[1] = np.inf  # the second axis is folded into the first
+        half[1] = np.inf  # the second axis is folded into the first and must not limit the depth
     return axes, np.asarray(obstacle.position, float), half, radius
 
 
@@ -168,19 +173,19 @@ def make_obstacles(
     data: mujoco.MjData | None = None,
     handled: Iterable[str] = (),
 ) -> tuple[Obstacle, ...]:
-    """Solid geoms that are fixed to the world, the ground (planes, height fields) apart.
+    """Make obstacles of the solid geoms fixed to the world, except planes and height fields.
 
-    Boxes, spheres, cylinders and capsules are exact; meshes and ellipsoids count by the box
-    around them.
+    Boxes, spheres, cylinders and capsules are exact; meshes and ellipsoids are replaced by their
+    bounding boxes.
 
     Args:
-        model: Model of the scene; the robot in it moves, so it is none.
-        movable: Bodies that count too, where they are.
-        data: Where they are; by default where the model starts.
-        handled: Those of `movable` that hands work at.
+        model: Model of the scene; the robot in it is not fixed, so it is no obstacle.
+        movable: Movable bodies to include at their present pose.
+        data: Present configuration; by default the initial one of the model.
+        handled: Bodies among `movable` that the hands work at.
 
     Raises:
-        UnknownName: If there is no such body; carries those that move.
+        UnknownName: If there is no such movable body; lists those there are.
     """
     if data is None:
         data = mujoco.MjData(model)
@@ -220,25 +225,25 @@ SIZES = {
     "cylinder": ("radius", "length"),
     "capsule": ("radius", "length"),
 }
-"""Keys that give the size of each shape."""
+"""Size keys of each shape in an obstacle file."""
 
 _OPTIONAL = ("name", "rpy")
 
 
 class BadObstacles(XopError, ValueError):
-    """A file of obstacles is missing or malformed; the message names the file and the fault."""
+    """An obstacle file is missing or malformed; the message names the file and the fault."""
 
     def __init__(self, path: object, fault: str) -> None:
         super().__init__(f"obstacles '{path}': {fault}")
 
 
 def load_obstacles(path: str | Path) -> tuple[Obstacle, ...]:
-    """Read obstacles; docs/how_it_works/retargeter.md has the format.
+    """Read an obstacle file; see docs/how_it_works/retargeter.md for the format.
 
     Raises:
-        BadObstacles: Naming the file, the entry and its fault.
+        BadObstacles: If it cannot be read or is malformed; names the file, entry and fault.
     """
-    import yaml  # noqa: PLC0415 (only who has such a file needs it)
+    import yaml  # noqa: PLC0415 (needed only for an obstacle file)
 
     try:
         content = load_yaml(Path(path).read_text(encoding="utf-8"))
@@ -262,7 +267,7 @@ def load_obstacles(path: str | Path) -> tuple[Obstacle, ...]:
 
 
 class _Fault(Exception):
-    """What is wrong with one entry."""
+    """Fault of one entry."""
 
 
 def _label(entry: Any, index: int) -> str:
@@ -271,7 +276,7 @@ def _label(entry: Any, index: int) -> str:
 
 
 def _parse(entry: Any, index: int) -> Obstacle:
-    """Make the obstacle of one entry."""
+    """Make the obstacle of one entry, or raise `_Fault`."""
     if not isinstance(entry, Mapping):
         raise _Fault(f"must be keys and values, got {entry!r}")
     shape = entry.get("shape")

@@ -1,4 +1,8 @@
-"""Settings that can be changed from any thread while the robot is driven."""
+"""Thread-safe changes of the settings and of the mode while the robot is driven.
+
+`OnlineSettings` validates changes in the requester's thread and applies them at the next tick;
+`ModeSwitch` arbitrates the requested mode.
+"""
 
 from __future__ import annotations
 
@@ -24,29 +28,29 @@ from xop_lerobot.retarget.presets import build_configs
 
 @dataclass(frozen=True)
 class AppliedChange:
-    """A change and where it came from.
+    """A change and its source.
 
     Attributes:
-        source: Who asked for it: `control`, `key`, `gesture`, `device`, `call`.
-        change: What was changed.
+        source: Source of the request: `control`, `key`, `gesture`, `device`, `call`.
+        change: The change.
     """
 
     source: str
     change: Change
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON knows it."""
+        """Return a JSON-compatible dictionary."""
         return {"source": self.source, "change": self.change.to_dict()}
 
 
 class ModeSwitch:
-    """Mode that is asked for: the last one of who asked, be it a change, a gesture or the device.
+    """The requested mode: the latest request wins, be it a change, a gesture or the device.
 
-    A device that states a mode in each frame, as recordings do, is heeded where it states another
-    than when it was overruled.
+    A device that reports a mode in every frame, as recordings do, would undo any other request at
+    once. So after being overruled it is ignored until the mode that it reports changes.
 
     Args:
-        mode: Mode to begin with.
+        mode: Initial mode.
     """
 
     def __init__(self, mode: Mode) -> None:
@@ -55,75 +59,75 @@ class ModeSwitch:
         self._overruled: Mode | None = None
 
     def set(self, mode: Mode) -> None:
-        """Overrule the device until it states another mode."""
+        """Overrule the device until it reports a different mode."""
         self.mode, self._overruled = mode, self._stated
 
     @property
     def other(self) -> Mode:
-        """The mode that is not asked for."""
+        """The mode that is not requested."""
         return Mode(1 - self.mode)
 
     def toggle(self) -> None:
-        """Change between the two modes, as a gesture does."""
+        """Switch to the other mode, as a gesture does."""
         self.mode = self.other
 
     def follow(self, stated: Mode | None) -> None:
-        """Take the mode that the device itself states, None if it states none."""
+        """Take the mode that the device reports, None if it reports none."""
         if stated is not None and stated is not self._overruled:
             self.mode, self._overruled = stated, None
         self._stated = stated
 
 
 class OnlineSettings:
-    """Takes changes from any thread and hands them over, all at once, at the next tick.
+    """Queue of changes from any thread, applied together at the next tick.
 
-    A change is checked against what will be in force when its turn comes, in the thread of who
-    asks for it: it is refused there with the reason, and then changes nothing. What is accepted
-    can't fail later.
+    A change is validated in the requester's thread, against the settings that will be in force
+    when it is applied. An invalid one is rejected there and changes nothing; an accepted one
+    cannot fail later.
 
-    However often somebody asks, what waits for the tick does not grow: of each thing that can be
-    changed (`split_change`) only what was asked for last is kept, with who asked. Applied in
-    order, what `take` returns makes the same settings as all that was asked for.
+    The queue is bounded, however often changes are requested: per setting (`split_change`) only
+    the last request is kept, with its source. Applied in order, the changes that `take` returns
+    give the same settings as all requests.
 
     Args:
         morphology: The robot.
         config: Settings of the session.
 
     Raises:
-        UnknownName: If `config` names a variant, target or part of the body that is not there.
+        UnknownName: If `config` names an unknown variant, target or part of the body.
     """
 
     def __init__(self, morphology: Morphology, config: RetargeterConfig) -> None:
         self._morphology, self._config = morphology, config
-        self._turn = threading.Lock()  # held by who asks, while a change is checked
-        self._lock = threading.Lock()  # held for an instant: the tick never waits for a check
+        self._turn = threading.Lock()  # serialises requests while they are validated
+        self._lock = threading.Lock()  # held briefly: the tick never waits for a validation
         self._coming = self._current = make_settings(morphology, config)
         self._pending: dict[tuple[str, ...], tuple[int, str, Any]] = {}  # request, source, value
         self._count = 0
 
     @property
     def current(self) -> Settings:
-        """What is in force."""
+        """Settings in force."""
         with self._lock:
             return self._current
 
     @property
     def coming(self) -> Settings:
-        """What will be in force at the next tick."""
+        """Settings that will be in force at the next tick."""
         with self._lock:
             return self._coming
 
     def request(self, change: Change, source: str) -> Settings:
-        """Ask for a change; returns what will be in force with it.
+        """Request a change; returns the settings that will be in force with it.
 
         Raises:
             UnknownName: If the robot has no such variant, target or part of the body.
-            BadValue: If the result would not be valid.
+            BadValue: If the resulting settings would be invalid.
         """
         return self.request_from(lambda _: change, source)
 
     def request_from(self, make: Callable[[Settings], Change], source: str) -> Settings:
-        """Ask for a change that depends on what will be in force, as a toggle does.
+        """Request a change that depends on the coming settings, such as a toggle.
 
         Raises:
             UnknownName: As `request`.
@@ -144,17 +148,17 @@ class OnlineSettings:
             return coming
 
     def _queue(self, change: Change, source: str) -> None:
-        """Add a change to those that wait, less what it makes void."""
+        """Append a change to the pending ones and drop those that it supersedes."""
         self._count += 1
         for part, value in split_change(change).items():
-            for void in [other for other in self._pending if _makes_void(part, other)]:
-                del self._pending[void]
+            for old in [other for other in self._pending if _supersedes(part, other)]:
+                del self._pending[old]
             self._pending[part] = (self._count, source, value)
 
     def take(self) -> tuple[AppliedChange, ...]:
-        """Put into force what was asked for since the last call, and return it in order.
+        """Apply the changes requested since the last call, and return them in order.
 
-        What was asked for anew before it came into force is left out.
+        Superseded requests are left out.
         """
         with self._lock:
             pending, self._pending = self._pending, {}
@@ -167,7 +171,7 @@ class OnlineSettings:
         )
 
 
-def _makes_void(part: tuple[str, ...], other: tuple[str, ...]) -> bool:
-    """Whether setting `part` leaves nothing of what was set of `other` before."""
+def _supersedes(part: tuple[str, ...], other: tuple[str, ...]) -> bool:
+    """Whether setting `part` overrides an earlier setting of `other`."""
     resets = {"preset": ("weights",), "variant": ("targets", "body")}
     return part == other or other[0] in resets.get(part[0], ())

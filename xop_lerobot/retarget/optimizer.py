@@ -1,4 +1,4 @@
-"""The interface of sampling optimizers, and the registry of them."""
+"""Interface and registry of sampling optimizers."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Samples(NamedTuple):
     """Sampled command sequences.
 
     Attributes:
-        knots: What the optimizer drew, for its own `update`. Shape (K, S, k).
-        commands: What is to be rolled out. Shape (K, T, k).
-        penalty: Cost that the sampling itself adds, or None. Shape (K,).
+        knots: Support points drawn by the optimizer, for its own `update`. Shape (K, S, k).
+        commands: Sequences to roll out. Shape (K, T, k).
+        penalty: Cost added by the sampling itself, or None. Shape (K,).
     """
 
     knots: np.ndarray
@@ -28,23 +28,23 @@ class Samples(NamedTuple):
 
 
 class SamplingOptimizer(ABC):
-    """Improves a plan, a sequence of T commands with k entries, from K scored samples of it.
+    """Improves a plan, a sequence of T commands with k entries, from K scored samples.
 
-    One solve is `shift`, `sample`, a rollout that scores the samples, `update`; `commands` is
-    the plan. What a subclass must keep (`tests/helpers/optimizer_contract.py` checks it):
+    One solve is `shift`, `sample`, a rollout that scores the samples, and `update`; `commands` is
+    the plan. Contract of a subclass (checked by `tests/helpers/optimizer_contract.py`):
 
     - After `reset(command)` the plan holds `command`, (k,) -> (T, k).
-    - `shift(steps)` moves the plan on by `steps` >= 0 control steps, not always whole ones. A
+    - `shift(steps)` advances the plan by `steps` >= 0 control steps, not necessarily an integer. A
       plan that holds a command still holds it after any shift.
     - `sample` returns K = `config.num_samples` sequences, all within the bounds. First comes
       the plan itself (unless `config.sample_plan` is off), then every candidate held over the
-      horizon, as many as there is room for, then noise around the plan: of standard deviation
-      `noise_std` at the support points right after a reset, none where it is zero. The same
+      horizon, as many as fit, then noise around the plan: of standard deviation `noise_std` at
+      the support points right after a reset, and none for entries where it is zero. The same
       generator state gives the same samples.
-    - `update` moves the plan to where the costs are low, and returns weights that sum to one.
-      A sample whose cost is not finite weighs nothing; if none is finite, the plan stays, with
-      all weight on the first sample.
-    - No array that is returned is changed later, and changing it changes nothing.
+    - `update` moves the plan towards low costs and returns weights that sum to one. A sample
+      whose cost is not finite has zero weight; if none is finite, the plan stays, with all weight
+      on the first sample.
+    - Returned arrays are copies: neither side sees later changes of the other.
 
     Args:
         horizon: Number of control steps T.
@@ -76,7 +76,7 @@ class SamplingOptimizer(ABC):
 
     @abstractmethod
     def shift(self, steps: float) -> None:
-        """Move the plan on by `steps` control steps."""
+        """Advance the plan by `steps` control steps."""
 
     @abstractmethod
     def sample(
@@ -87,16 +87,16 @@ class SamplingOptimizer(ABC):
         Args:
             rng: Source of randomness.
             noise_std: Standard deviation of every entry. Shape (k,).
-            candidates: Commands to try held over the horizon. Shape (c, k).
+            candidates: Fixed commands, each held over the horizon. Shape (c, k).
         """
 
     @abstractmethod
     def update(self, samples: Samples, costs: np.ndarray) -> np.ndarray:
-        """Improve the plan from what `samples` cost, (K,). Returns their weights, (K,)."""
+        """Improve the plan by the `costs` of `samples`, (K,). Returns their weights, (K,)."""
 
 
 Factory = Callable[[int, np.ndarray, np.ndarray, MpcConfig], SamplingOptimizer]
-"""(horizon, low, high, config) -> optimizer; a class is one."""
+"""(horizon, low, high, config) -> optimizer; usually a class."""
 
 OPTIMIZERS: Registry[Factory] = Registry("optimizer", {"kmppi": "xop_lerobot.retarget.kmppi:Kmppi"})
 

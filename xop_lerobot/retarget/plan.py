@@ -1,6 +1,7 @@
-"""What a retargeter returns, the interface of retargeters, and plans in time.
+"""Interface of retargeters, the plans that they return, and playback of plans over time.
 
-`PlanTrack` says which of several stamped plans counts at an instant, and its command then.
+A `Retargeter` turns a robot state and a goal into a `Plan`. `StampedPlan` places a plan on the
+robot's clock, and `PlanTrack` selects the plan in force at a given time.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ class Plan:
     Attributes:
         command: Command to execute now, before limits. Shape (k,).
         commands: The planned sequence, one for each control step. Shape (H, k).
-        mode: The mode it is for.
+        mode: Mode that the plan was made for.
         qpos: Predicted positions under the plan's best sample; empty for `direct`. (H + 1, nq).
         velocities: Predicted linear velocity of the base under that sample, world axes [m/s]; empty
             for `direct`. Shape (H + 1, 3).
-        arms: Targets of the arm joints that the retargeter decided itself, by joint, one for
-            each control step [rad]; the others are left to inverse kinematics. Shapes (H,).
+        arms: Targets of the arm joints that the plan decides, by joint, one per control step
+            [rad]; the other joints are left to inverse kinematics. Shapes (H,).
         cost: Cost of the best sample by term.
-        health: Further figures by name: `intervention` (see `Intervention`) and `risk`.
+        health: Further health metrics by name: `intervention` (see `Intervention`) and `risk`.
         status: How the solve ended.
         effective_samples: Effective sample size of the update [1].
-        timings: Time spent, by part [s]; ``"solve"`` is the whole.
+        timings: Time spent, by part [s]; ``"solve"`` is the total.
     """
 
     command: np.ndarray
@@ -67,10 +68,9 @@ class Retargeter(ABC):
 
     Attributes:
         cost_names: Names of the cost terms of its plans, in order.
-        frames: The tracked frames it drives; the arms' inverse kinematics follow the others.
-        holds_place: Whether it brings the head back to its goal's place. Of one that does not,
-            arms go with the head: the place of their goals in the world is lost with the first
-            step.
+        frames: Tracked frames that it controls; inverse kinematics of the arms follow the others.
+        holds_place: Whether it closes the loop on the head's position. If not, wrist goals move
+            with the head: their positions in the world are lost as soon as the robot walks.
     """
 
     cost_names: tuple[str, ...] = ()
@@ -79,7 +79,7 @@ class Retargeter(ABC):
 
     @abstractmethod
     def reset(self, state: RobotState) -> None:
-        """Forget all plans; the next one starts from the command that `state` executes."""
+        """Discard all plans; the next one starts from the command that `state` executes."""
 
     @abstractmethod
     def plan(self, state: RobotState, goal: Goal) -> Plan:
@@ -96,11 +96,11 @@ class Retargeter(ABC):
         body: tuple[str, ...] | None = None,
         constraints: frozenset[str] | None = None,
     ) -> None:
-        """Change settings from the next solve on; nothing for a retargeter that has none."""
+        """Change settings from the next solve on; no effect for a retargeter without settings."""
         del configs, targets, body, constraints
 
     def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Keep clear of these and no others from the next solve on, where it does so at all."""
+        """Replace the obstacles to avoid; no effect for a retargeter that ignores obstacles."""
         del obstacles
 
     def close(self) -> None:
@@ -108,18 +108,18 @@ class Retargeter(ABC):
 
 
 GRACE_S = 0.1
-"""How long the last command of a plan that has ended is held before the robot brakes [s]."""
-_KEPT = 4
+"""Time for which the last command of an expired plan is held before velocities stop [s]."""
+_KEPT = 4  # plans that a track keeps: a delayed one may not be due yet
 
 
 class StampedPlan(NamedTuple):
-    """A plan and the times of the robot's clock that it belongs to.
+    """A plan with its times on the robot's clock.
 
     Attributes:
         plan: The plan.
-        time: When its first command is due [s].
-        measured: When the state was measured that it comes from [s].
-        period: Time from plan to plan in its mode [s].
+        time: Time at which its first command is due [s].
+        measured: Time at which the state that it is based on was measured [s].
+        period: Time between two plans in its mode [s].
     """
 
     plan: Plan
@@ -128,17 +128,17 @@ class StampedPlan(NamedTuple):
     period: float = 0.0
 
     def get_step(self, time: float) -> int:
-        """Index of the entry that is due at `time`; the first before, the last after its end."""
+        """Index of the command due at `time`; clamped to the first and the last one."""
         step = round((time - self.time) / POLICY_DT)
         return min(max(step, 0), len(self.plan.commands) - 1)
 
     def has_run_out(self, time: float) -> bool:
-        """Whether `time` is beyond all that the plan, or holding its end, can be good for."""
+        """Whether `time` is more than `GRACE_S` past the end of the plan."""
         length = max(len(self.plan.commands) * POLICY_DT, self.period)
         return time - self.time > length + GRACE_S
 
     def get_command(self, time: float, space: CommandSpace) -> np.ndarray:
-        """The command that is due at `time`. Once it has run out, velocities are neutral. (k,)."""
+        """The command due at `time`, with neutral velocities once the plan has run out. (k,)."""
         command = self.plan.commands[self.get_step(time)]
         if self.has_run_out(time):
             return np.where(space.mobile_only, space.neutral, command)
@@ -150,7 +150,7 @@ class StampedPlan(NamedTuple):
         return {name: float(angles[step]) for name, angles in self.plan.arms.items()}
 
     def compute_health(self, time: float) -> dict[str, float]:
-        """Figures on the plan's health at `time` for a recording, by name."""
+        """Health metrics of the plan at `time` for a recording, by name."""
         return {
             "solve_time": self.plan.timings.get("solve", 0.0),
             "plan_age": time - self.measured,
@@ -163,10 +163,10 @@ class StampedPlan(NamedTuple):
         """Predicted linear velocity of the base at `time`, world axes [m/s].
 
         Returns:
-            Shape (3,); None beyond what was predicted.
+            Shape (3,); None outside the predicted horizon.
         """
         velocities, step = self.plan.velocities, (time - self.time) / POLICY_DT
-        if not -0.5 <= step <= len(velocities) - 0.5:  # half a step is nothing
+        if not -0.5 <= step <= len(velocities) - 0.5:  # tolerate half a step of rounding
             return None
         step = min(max(step, 0.0), len(velocities) - 1.0)
         first = min(int(step), max(len(velocities) - 2, 0))
@@ -176,7 +176,7 @@ class StampedPlan(NamedTuple):
 
 
 class PlanTrack:
-    """The last few plans; each counts from when it is due until the next one is.
+    """The last few plans; each is in force from its due time until that of the next one.
 
     Args:
         plans: Plans in the order in which they were made.
@@ -186,7 +186,7 @@ class PlanTrack:
         self._plans: deque[StampedPlan] = deque(plans, maxlen=_KEPT)
 
     def copy(self) -> PlanTrack:
-        """Return one with the same plans."""
+        """Return a track with the same plans."""
         return PlanTrack(self._plans)
 
     def add(self, plan: StampedPlan) -> None:
@@ -194,7 +194,7 @@ class PlanTrack:
         self._plans.append(plan)
 
     def clear(self) -> None:
-        """Forget all plans."""
+        """Discard all plans."""
         self._plans.clear()
 
     @property
@@ -203,7 +203,7 @@ class PlanTrack:
         return self._plans[-1] if self._plans else None
 
     def at(self, time: float) -> StampedPlan | None:
-        """The plan that counts at `time`: the newest that is due, else the oldest; or none."""
+        """The plan in force at `time`: the newest that is due, else the oldest; None if empty."""
         for plan in reversed(self._plans):
             if plan.time <= time + POLICY_DT / 2:
                 return plan
@@ -211,6 +211,6 @@ class PlanTrack:
 
 
 def overlay_arms(arms: np.ndarray, names: tuple[str, ...], decided: Mapping[str, float]) -> None:
-    """Write the targets in `decided` over those in `arms`, which are in the order of `names`."""
+    """Overwrite the entries of `arms`, in the order of `names`, by the targets in `decided`."""
     for name, angle in decided.items():
         arms[names.index(name)] = angle

@@ -1,8 +1,9 @@
-"""Plans when it is due, in lock-step or in the background, and plays plans out.
+"""Schedule solves of a retargeter, in lock-step or in a background thread, and play their plans.
 
-`BackgroundPlanner` runs a retargeter in a thread of its own: the newest plan, never a wait for it.
-`StatePredictor` computes where the robot will be when such a plan takes effect, and `predict_goal`
-where its goal will be.
+`PlanFollower` is what the control loop calls once a tick. On the wall clock it solves in a
+`BackgroundPlanner`, which never blocks the tick, and compensates the solver's delay: each solve
+starts from the state (`StatePredictor`) and goal (`predict_goal`) expected when its plan takes
+effect.
 """
 
 from __future__ import annotations
@@ -35,16 +36,15 @@ class _Job(NamedTuple):
 
 
 class BackgroundPlanner:
-    """Solves in a thread for the newest state and goal that were submitted.
+    """Solves in a thread of its own, always for the newest submitted state and goal.
 
-    A slow solve drops the states that came meanwhile: the next one starts from the newest,
-    predicted to when its plan will take effect. What a solve raises is raised in the caller, by
-    `submit`, `latest` and `at`, until the next `reset`.
+    States that arrive during a slow solve are dropped. An exception in a solve is raised again in
+    the caller by `submit`, `latest` and `at`, until the next `reset`.
 
     Args:
-        retargeter: What solves; used by the thread alone from now on.
+        retargeter: The retargeter; from now on only the thread may use it.
         predictor: Predicts the state a plan starts from; None starts from the measured one.
-        threaded: False solves in `run_once` alone, for tests.
+        threaded: Whether to start the thread; without it, tests call `run_once`.
     """
 
     def __init__(
@@ -70,15 +70,15 @@ class BackgroundPlanner:
             self._thread.start()
 
     def submit(self, state: RobotState, goal: Goal, ahead: int = 0) -> None:
-        """Ask for a plan from `state` to `goal`; replaces what has not been begun.
+        """Request a plan from `state` to `goal`; replaces a pending request.
 
         Args:
-            state: The robot now.
-            goal: The goal now.
+            state: Present state of the robot.
+            goal: Present goal.
             ahead: Control steps after which the plan will take effect [20 ms].
 
         Raises:
-            Exception: Whatever the last solve failed with.
+            Exception: The exception of the last solve, if it failed.
         """
         with self._ready:
             self._check()
@@ -90,37 +90,37 @@ class BackgroundPlanner:
         """The newest plan since the last `reset`, None before the first.
 
         Raises:
-            Exception: Whatever the last solve failed with.
+            Exception: The exception of the last solve, if it failed.
         """
         with self._ready:
             self._check()
             return self._track.newest
 
     def at(self, time: float) -> StampedPlan | None:
-        """The plan that counts at `time` [s] of the robot's clock, None before the first.
+        """The plan in force at `time` [s] of the robot's clock, None before the first.
 
         Raises:
-            Exception: Whatever the last solve failed with.
+            Exception: The exception of the last solve, if it failed.
         """
         with self._ready:
             self._check()
             return self._track.at(time)
 
     def configure(self, **settings: Any) -> None:
-        """Give the retargeter other settings (`MpcRetargeter.configure`) before its next solve."""
+        """Change settings (`MpcRetargeter.configure`) before the next solve."""
         with self._ready:
             self._settings = (self._settings or {}) | settings
 
     def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Give the retargeter other obstacles (`Retargeter.set_obstacles`) before its next solve.
+        """Replace the obstacles (`Retargeter.set_obstacles`) before the next solve.
 
-        They are handed over in the solving thread, never in the middle of a solve.
+        The solving thread applies them, so never in the middle of a solve.
         """
         with self._ready:
             self._obstacles = obstacles
 
     def reset(self, state: RobotState) -> None:
-        """Forget all plans, also the one being solved, and failures; start anew from `state`."""
+        """Discard all plans, also the one being solved, and failures; restart from `state`."""
         with self._ready:
             self._epoch += 1
             self._job = self._failure = None
@@ -136,7 +136,7 @@ class BackgroundPlanner:
             self._thread.join()
 
     def _check(self) -> None:
-        """Raise what the last solve failed with; the caller holds the lock."""
+        """Raise the exception of the last solve, if it failed; the caller holds the lock."""
         if self._failure is not None:
             raise self._failure
 
@@ -149,7 +149,7 @@ class BackgroundPlanner:
             self.run_once()
 
     def run_once(self) -> None:
-        """Solve what was asked for last, if anything; the thread does nothing else."""
+        """Solve the pending request, if any. The thread calls nothing else."""
         with self._ready:
             job, self._job = self._job, None
             reset_to, settings = self._reset_to, self._settings
@@ -163,6 +163,7 @@ class BackgroundPlanner:
                 self._retargeter.configure(**settings)
             if obstacles is not None:
                 self._retargeter.set_obstacles(obstacles)
+            # A reset since the last solve: apply it in this thread, the retargeter's only user.
             if job.epoch != self._solved_epoch and reset_to is not None:
                 self._retargeter.reset(reset_to)
                 self._solved_epoch = job.epoch
@@ -174,11 +175,11 @@ class BackgroundPlanner:
                     self._failure, self._job = failure, None
             return
         with self._ready:
-            if job.epoch == self._epoch:
+            if job.epoch == self._epoch:  # else a reset came meanwhile and the plan is void
                 self._track.add(plan)
 
     def _solve(self, job: _Job, track: PlanTrack) -> StampedPlan:
-        """Plan from where the robot will be when the plan takes effect."""
+        """Plan from the state predicted for the time when the plan takes effect."""
         state, goal = job.state, job.goal
         if self._predictor is not None:
             state = self._predictor.predict(state, track, job.ahead)
@@ -188,15 +189,15 @@ class BackgroundPlanner:
         return StampedPlan(plan, state.time, job.state.time, period)
 
 
-_GOAL_S = 0.3  # longest time over which a goal is assumed to keep its velocity [s]
+_GOAL_S = 0.3  # longest time for which a goal is assumed to keep its velocity [s]
 
 
 class LatencyMeter:
-    """Median time from the measurement to the first tick that can use its plan.
+    """Median time from a measurement to the first tick that can use its plan.
 
     Args:
-        window: Number of plans that count.
-        longest: Latency beyond which the prediction does not follow [s].
+        window: Number of plans in the median.
+        longest: Upper bound of the latency that is compensated [s].
     """
 
     def __init__(self, window: int = 15, longest: float = 0.3) -> None:
@@ -204,16 +205,16 @@ class LatencyMeter:
         self.longest = longest
 
     def add(self, latency: float) -> None:
-        """Take one more [s]."""
+        """Add one latency [s]."""
         self._latencies.append(latency)
 
     def reset(self) -> None:
-        """Forget all."""
+        """Discard all latencies."""
         self._latencies.clear()
 
     @property
     def median(self) -> float:
-        """The median [s]; 0 before the first."""
+        """The median [s]; 0 before the first plan."""
         return float(np.median(self._latencies)) if self._latencies else 0.0
 
     @property
@@ -223,13 +224,13 @@ class LatencyMeter:
 
 
 class StatePredictor:
-    """Rolls a state forward under the commands that will be executed meanwhile.
+    """Predicts a state under the commands that will be executed until then.
 
-    One rollout, with the low-level policy and its memory in the loop, as the planner's own.
+    One rollout, like the planner's own, with the low-level policy and its memory in the loop.
 
     Args:
         morphology: The robot.
-        rollout: The planner's rollouts; used by the thread that plans.
+        rollout: The planner's rollouts; only the planning thread may use them.
     """
 
     def __init__(self, morphology: Morphology, rollout: PolicyRollout) -> None:
@@ -239,12 +240,12 @@ class StatePredictor:
         """Predict the state `steps` control steps later.
 
         Args:
-            state: The robot now.
-            track: Plans that are played out meanwhile; without one the robot holds.
-            steps: How far [20 ms].
+            state: Present state of the robot.
+            track: Plans that are executed meanwhile; without one the robot holds its command.
+            steps: Control steps to predict [20 ms].
 
         Returns:
-            The state then; `state` itself for no steps, or if the prediction diverges.
+            The predicted state; `state` itself for no steps or if the prediction diverges.
         """
         if steps < 1:
             return state
@@ -281,7 +282,7 @@ class StatePredictor:
 
 
 def predict_goal(goal: Goal, delay: float) -> Goal:
-    """Where the goal will be after `delay` [s], if it keeps its velocity."""
+    """The goal after `delay` [s] at constant velocity."""
     if delay <= 0:
         return goal
     ahead = preview(goal, tuple(goal.poses), np.array([delay]), _GOAL_S)
@@ -289,14 +290,14 @@ def predict_goal(goal: Goal, delay: float) -> Goal:
 
 
 class PlanFollower:
-    """Knows the plan that counts.
+    """Keeps the plan in force up to date.
 
-    In lock-step a plan counts from the instant of its state. On the wall clock it comes late:
-    each solve starts from the state predicted to when its plan is expected to take effect, by
-    the median of what the last plans took, and until then the last plan is played out.
+    In lock-step a plan takes effect at the time of its state. On the wall clock it arrives late:
+    each solve starts from the state predicted for the time when its plan is expected to take
+    effect (median latency of the last plans), and the previous plan is executed until then.
 
     Args:
-        retargeter: What plans.
+        retargeter: The retargeter.
         morphology: The robot.
         dt: Control period [s].
         realtime: Whether the robot's clock is the wall clock.
@@ -316,28 +317,28 @@ class PlanFollower:
         self.forget()
 
     def forget(self) -> None:
-        """Have no plan any more."""
+        """Discard the current plan."""
         self.current: StampedPlan | None = None
         self._asked_time = self._seen_time = float("-inf")
 
     def reset(self, state: RobotState) -> None:
-        """Start anew from what `state` executes, as at an engagement."""
+        """Restart from the command that `state` executes, as on engagement."""
         (self.background or self.retargeter).reset(state)
         self.forget()
 
     def configure(self, **settings: Any) -> None:
-        """Give the retargeter other settings from its next solve on."""
+        """Change settings of the retargeter from its next solve on."""
         (self.background or self.retargeter).configure(**settings)
 
     def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Give the retargeter other obstacles from its next solve on."""
+        """Replace the obstacles of the retargeter from its next solve on."""
         (self.background or self.retargeter).set_obstacles(obstacles)
 
     def update(self, state: RobotState, goal: Goal) -> None:
-        """Plan where it is due; on the wall clock, ask for it and take the newest there is."""
+        """Solve if a plan is due; on the wall clock, request it and take the newest there is."""
         late = self.current is None or self.current.plan.mode is not goal.mode
         period = self.retargeter.control_period(goal.mode)
-        # Half a tick early is closer than half a tick late.
+        # Ticks rarely hit the period exactly: take the nearest one, also if it is a bit early.
         due = late or state.time - self._asked_time >= period - self.dt / 2
         if self.background is None:
             if due:
@@ -352,15 +353,15 @@ class PlanFollower:
         self.current = self.background.at(state.time)
 
     def predict_velocity(self, time: float, since: float) -> np.ndarray | None:
-        """Velocity of the base at `time` by the newest plan, for the state synchronisation.
+        """Velocity of the base at `time` as predicted by the newest plan, for state sync.
 
         Args:
             time: The robot's clock [s].
-            since: When the state was measured that the plan must have started from [s]. An older
-                plan tells nothing that the state of `since` does not know already.
+            since: Time of the measurement that the plan must be based on [s]. An older plan holds
+                no information that the synchronised state of `since` does not have already.
 
         Returns:
-            Linear velocity, world axes [m/s], shape (3,); None where no plan tells.
+            Linear velocity, world axes [m/s], shape (3,); None without such a plan.
         """
         if self.current is None:
             return None

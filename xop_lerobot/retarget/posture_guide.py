@@ -1,4 +1,8 @@
-"""Holds the head's goal within what the robot can serve, and knows the posture for it."""
+"""Limits the head's goal to what the robot can reach, and finds the posture for it.
+
+`PostureGuide.hold` limits the goal of a robot in stationary mode, `PostureGuide.find` returns the
+posture (`Served`) at it. Only robots that stand or drive use it; a walking robot gets no posture.
+"""
 
 from __future__ import annotations
 
@@ -38,28 +42,30 @@ from xop_lerobot.retarget.model.proposal import KinematicProposal, make_proposal
 from xop_lerobot.retarget.static_load import StaticLoad
 
 HEAD = "head"
-_EFFORT, _LEVEL_EFFORT = 0.002, 0.01  # of a posture, which has all the time to get there
-_NEAR, _SAME = 0.01, 0.03  # by which a goal may be missed before it is moved [m], [rad]
-_EXTEND = 0.02  # by which the reach of a robot that stands changes in a solve [m]
-_FARTHEST = 1.0  # its largest [m]
-_STILL = 0.1  # speed of a goal under which it counts as standing still [m/s]
-_OFF, _PATIENCE = 0.06, 25  # error of the height [m], and solves, from which a robot is stuck
-_CREEP = 0.02  # speed that counts as none [m/s], [rad/s]
-_BEYOND = 0.6  # turn past half a turn at which the other way round is taken [rad]
+# Effort weights of a posture; below the proposal's 0.02, since there is no deadline to reach it.
+_EFFORT, _LEVEL_EFFORT = 0.002, 0.01
+_NEAR, _SAME = 0.01, 0.03  # error of the posture up to which the goal is not corrected [m], [rad]
+_EXTEND = 0.02  # change of the reach of a standing robot per solve [m]
+_FARTHEST = 1.0  # its upper bound [m]
+_STILL = 0.1  # speed below which a goal counts as stationary [m/s]
+_OFF, _PATIENCE = 0.06, 25  # height error [m] and number of solves that make a robot stuck
+_CREEP = 0.02  # tolerance on velocities that count as zero [m/s], [rad/s]
+_BEYOND = 0.6  # hysteresis: angle past half a turn at which the waist changes sides [rad]
 
 
 class Served(NamedTuple):
-    """How a robot would be at the head's goal.
+    """Posture of a robot at the head's goal.
 
     Attributes:
         natural: The command that holds the posture. Shape (n,).
-        balance: Where its centre of mass is on the base; None for a robot without support area.
-            Shape (2,).
-        ahead: How far ahead of the base the head is then [m].
-        shift: What the posture misses of the goal, world axes [m]. Shape (3,).
-        turn: The same of its orientation: a tilt about X and Y, then a turn [rad]. Shape (3,).
-        detour: Whether the robot has to go another way than nearer and nearer.
-        brakes: Whether that is to stop first, in the posture it has.
+        balance: Position of its centre of mass in the base's frame; None for a robot without
+            support area. Shape (2,).
+        ahead: Forward distance of the head from the base in it [m].
+        shift: Position of the head in the posture less the goal, world axes, beyond a tolerance
+            [m]. Shape (3,).
+        turn: The same for the orientation: tilt about X and Y, then heading [rad]. Shape (3,).
+        detour: Whether the way to the posture leads away from the goal at first.
+        brakes: Whether the robot has to stop first, in its present posture.
     """
 
     natural: np.ndarray
@@ -71,7 +77,7 @@ class Served(NamedTuple):
     brakes: bool = False
 
     def move(self, track: np.ndarray) -> np.ndarray:
-        """Move goals to where they can be served. (n, 7) -> (n, 7)."""
+        """Move goals by the error of the posture, to where they can be reached. (n, 7)."""
         if not self.shift.any() and not self.turn.any():
             return track
         tilt = quat_exp(np.array([self.turn[0], self.turn[1], 0.0]))
@@ -80,22 +86,21 @@ class Served(NamedTuple):
 
 
 class PostureGuide:
-    """Tells in which posture the robot would be at the head's goal, and how much it misses.
+    """Finds the posture at the head's goal, and the error that remains in it.
 
-    In stationary mode that is a posture for the whole pose, on the feet or the base that stand.
-    First the goal is held near the place where the head rests, unless the robot can be where it
-    is, and its heading within what the waist turns: what cannot be served would only contort the
-    robot. What still brakes after a change of mode keeps its posture until it stands: a torso
-    that leans after its goal, or back, meanwhile needs more torque than it has. A robot that
-    drives is in the right posture when height and nod are right: the rest is the wheels'. A
-    walking robot, which takes no posture, gets none.
+    In stationary mode the posture is for the whole pose, with feet or base fixed. First the goal
+    is limited: to a distance from the head's rest position unless the robot can reach it, and to
+    the heading range of the waist; an unreachable goal would only contort the robot. A robot that
+    still brakes after a change of mode keeps its posture until it stands, since leaning meanwhile
+    needs more torque than the torso has. In mobile mode, on wheels, the posture is for height and
+    pitch only; the rest is up to the wheels. A walking robot has no posture.
 
     Args:
         morphology: The robot.
         model: Its planning model.
-        command_model: What a decision does.
-        support: Area over which the centre of mass stays; None for a robot that balances itself.
-        load: What joints bear of the weight above them; None where a policy moves them.
+        command_model: First-order model of the effect of a decision.
+        support: Support area for the centre of mass; None for a robot that balances itself.
+        load: Static loads of the joints; None if a policy moves them.
     """
 
     def __init__(
@@ -133,32 +138,32 @@ class PostureGuide:
         self.reset()
 
     def configure(self, configs: Mapping[Mode, MpcConfig], sites: Mapping[str, str]) -> None:
-        """Take other parameters or targets; there are postures for a head alone."""
+        """Set the parameters and targets; postures exist only for the head."""
         self._searches, self._level, self._free = {}, None, None
         self._start()
         if HEAD not in sites:
             return
         still = configs[Mode.STATIONARY]
-        # A chain of many joints has several postures for a goal; a waist on legs has one.
+        # A redundant chain has several postures for a goal; a waist on legs has only one.
         chain = self._morphology.servos is not None
-        self._searches[Mode.STATIONARY] = self._make_search(still, level=False, way=chain)
+        self._searches[Mode.STATIONARY] = self._make_search(still, level=False, detours=chain)
         self._free = self._make_search(still, level=False)
         self._level = self._make_search(still, level=True)
         if self._command_model.is_nonholonomic:
             self._searches[Mode.MOBILE] = self._make_search(
-                configs[Mode.MOBILE], level=True, upright=True, way=chain
+                configs[Mode.MOBILE], level=True, upright=True, detours=chain
             )
 
     def _make_search(
-        self, config: MpcConfig, *, level: bool, upright: bool = False, way: bool = False
+        self, config: MpcConfig, *, level: bool, upright: bool = False, detours: bool = False
     ) -> PostureSearch:
         """Make a search.
 
         Args:
-            config: Whose weights it takes.
-            level: Whether it is for height and tilt alone.
-            upright: Whether it does without a lean aside.
-            way: Whether it looks at the way to the posture.
+            config: Parameters whose weights it uses.
+            level: Whether it is for height and tilt only.
+            upright: Whether roll joints stay neutral.
+            detours: Whether it detects detours (`Found.detour`).
         """
         weights = make_proposal_weights(config.weights)
         used = np.ones(len(self._vertical), dtype=bool)
@@ -182,11 +187,11 @@ class PostureGuide:
             self._load,
         )
         return PostureSearch(
-            problem, self._repertoire, used, self._limits, strict=level, looks_at_way=way
+            problem, self._repertoire, used, self._limits, strict=level, detects_detours=detours
         )
 
     def reset(self) -> None:
-        """Start anew."""
+        """Forget previous goals and postures."""
         for search in (*self._searches.values(), self._level, self._free):
             if search is not None:
                 search.reset()
@@ -196,12 +201,12 @@ class PostureGuide:
         self._beside, self._reach, self._waited = 0.0, self._morphology.standing_reach, 0
 
     def hold(self, goal: Goal, state: PlannerState, preview_s: float) -> Goal:
-        """Hold the goal of a robot that stands near the place where its head rests.
+        """Limit the goal in stationary mode to what the robot can reach.
 
         Args:
             goal: The goal.
-            state: Where the robot is.
-            preview_s: Time over which it is assumed to keep its velocity [s].
+            state: The planner's state.
+            preview_s: Time for which the goal is assumed to keep its velocity [s].
         """
         if (
             self._level is None
@@ -218,18 +223,19 @@ class PostureGuide:
         place = axes @ (pose[:2] - qpos[:2])
         beyond = self._compute_turn_beyond(pose[3:], heading)
         velocity = goal.velocities.get(HEAD, np.zeros(6))
-        end = place + preview_s * (axes @ velocity[:2])  # where it is led to
+        end = place + preview_s * (axes @ velocity[:2])  # goal at the end of the preview
         far = max(math.dist(each, self._resting) for each in (place, end))
         is_far = far > self._morphology.standing_reach
         reachable = False
         if beyond or is_far:
             reachable = self._free.find(HEAD, state, pose).missed <= MISSED
-        if beyond and not reachable:  # a tilted head may look further aside than the waist turns
+        if beyond and not reachable:  # a tilted head may exceed the waist's range and be reachable
             pose[3:] = quat_multiply(quat_from_yaw(-beyond), pose[3:])
             reachable = self._free.find(HEAD, state, pose).missed <= MISSED
         self._adapt_reach(reachable and is_far, moving=_is_moving(goal))
         if is_far:
-            # Who bows or squats has the head elsewhere; up to there it is no matter of reach.
+            # A robot that bows or squats moves its head forward. So the reach counts from the line
+            # between the head at rest and the head in the posture for the goal's height and tilt.
             found = self._level.find(HEAD, state, pose)
             bowed, _ = self._place(state.start, found.command)
             bowed = axes @ (bowed[:2] - qpos[:2])
@@ -242,13 +248,16 @@ class PostureGuide:
         return dataclasses.replace(goal, poses={**goal.poses, HEAD: pose}, velocities=velocities)
 
     def _is_braking(self, executed: np.ndarray) -> bool:
-        """Whether more is executed than what sways a robot that stands."""
+        """Whether the executed velocities exceed those of a weight shift in place."""
         sway = self._command_model.compute_twist(self._command_model.space.sway)
         twist = self._command_model.compute_twist(executed)
         return bool((np.abs(twist) > sway + _CREEP).any())
 
     def _is_stuck(self, goal: Goal, qpos: np.ndarray) -> bool:
-        """Whether a robot that drives stays above or below a goal that stands, from then on."""
+        """Whether a driving robot misses the height of a stationary goal for `_PATIENCE` solves.
+
+        Latched until the goal moves.
+        """
         if _is_moving(goal):
             self._waited = 0
         elif self._waited < _PATIENCE:
@@ -258,13 +267,13 @@ class PostureGuide:
         return self._waited >= _PATIENCE
 
     def _adapt_reach(self, reachable: bool, *, moving: bool) -> None:
-        """Let the goal go further off where the robot can be there, and take it back where not."""
+        """Extend the reach while the goal is reachable, and shrink it back otherwise."""
         least = self._morphology.standing_reach
         change = (0.0 if moving else _EXTEND) if reachable else -_EXTEND
         self._reach = min(max(self._reach + change, least), _FARTHEST)
 
     def _compute_turn_beyond(self, quat: np.ndarray, base: float) -> float:
-        """How far a goal looks beyond what the waist turns, on the side where it was [rad]."""
+        """Angle by which a goal's heading exceeds the waist's range, on its previous side [rad]."""
         beside = float(compute_heading(quat)) - base
         beside = self._beside + math.remainder(beside - self._beside, math.tau)
         if abs(beside) > math.pi + _BEYOND:
@@ -275,12 +284,12 @@ class PostureGuide:
         return beside - min(max(beside, space.low[waist].sum()), space.high[waist].sum())
 
     def find(self, goal: Goal, pose: np.ndarray, state: PlannerState) -> Served | None:
-        """Find the posture for the head at `pose`; None where the mode knows none.
+        """Find the posture for the head at `pose`; None if the mode uses none at the moment.
 
         Args:
             goal: The goal.
-            pose: That of the head that counts. Shape (7,).
-            state: Where the robot is.
+            pose: Predicted goal pose of the head. Shape (7,).
+            state: The planner's state.
         """
         search = self._searches.get(goal.mode)
         if search is None:
@@ -297,7 +306,7 @@ class PostureGuide:
         if not np.isfinite(found.command).all():
             search.reset()
             return None
-        # On the way, to be in the posture for the goal of now takes more torque than to follow it.
+        # On the way, holding the posture of the present goal takes more torque than following it.
         if goal.mode is Mode.MOBILE and not self._is_stuck(goal, state.qpos):
             return None
         return self._describe(found, goal.mode, pose, state)
@@ -309,19 +318,19 @@ class PostureGuide:
         cosine, sine = math.cos(heading), math.sin(heading)
         to_base = np.array([[cosine, sine], [-sine, cosine]])
         shift, turn = there[:3] - pose[:3], heading_error(there[3:], pose[3:])
-        if mode is Mode.MOBILE:  # the rest is not the posture's
+        if mode is Mode.MOBILE:  # horizontal position and heading are up to the wheels
             shift[:2], turn[2] = 0.0, 0.0
         return Served(
             natural=found.command,
             balance=to_base @ (com[:2] - qpos[:2]) if self._support is not None else None,
             ahead=float(to_base[0] @ (there[:2] - qpos[:2])),
-            shift=_forgive(shift, _NEAR),
-            turn=_forgive(turn, _SAME),
+            shift=_subtract_tolerance(shift, _NEAR),
+            turn=_subtract_tolerance(turn, _SAME),
             detour=found.detour,
         )
 
     def _place(self, start: Start, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of the head (7,) and centre of mass (3,) of a robot at rest under a command."""
+        """Pose of the head (7,) and centre of mass (3,) once the robot has settled on a command."""
         future = self._command_model.extrapolate(
             start.without_ramp(), command, AT_REST_S, Mode.STATIONARY
         )
@@ -330,28 +339,28 @@ class PostureGuide:
 
 
 def _is_moving(goal: Goal) -> bool:
-    """Whether the goal of the head is on its way somewhere."""
+    """Whether the goal of the head moves horizontally."""
     velocity = goal.velocities.get(HEAD)
     return velocity is not None and math.hypot(velocity[0], velocity[1]) > _STILL
 
 
 def _remove_roll(pose: np.ndarray) -> np.ndarray:
-    """A pose with its heading and its nod alone. Shape (7,)."""
+    """Keep only heading and pitch of a pose. Shape (7,)."""
     heading = quat_from_yaw(float(compute_heading(pose[3:])))
     x, _, z = quat_rotate(quat_multiply(quat_conjugate(heading), pose[3:]), np.eye(3)[0])
-    nod = quat_exp(np.array([0.0, math.atan2(-z, x), 0.0]))
-    return make_pose(pose[:3], quat_multiply(heading, nod))
+    pitch = quat_exp(np.array([0.0, math.atan2(-z, x), 0.0]))
+    return make_pose(pose[:3], quat_multiply(heading, pitch))
 
 
-def _forgive(error: np.ndarray, tolerance: float) -> np.ndarray:
-    """What of an error is beyond a tolerance. Shape (3,)."""
+def _subtract_tolerance(error: np.ndarray, tolerance: float) -> np.ndarray:
+    """Part of an error that exceeds a tolerance. Shape (3,)."""
     return error * max(0.0, 1 - tolerance / max(float(np.linalg.norm(error)), 1e-12))
 
 
 def _hold_near_line(
     point: np.ndarray, start: np.ndarray, end: np.ndarray, reach: float
 ) -> np.ndarray:
-    """Move a point to within `reach` of the line from `start` to `end`. Shapes (2,)."""
+    """Move a point to within `reach` of the segment from `start` to `end`. Shapes (2,)."""
     along = end - start
     share = float(along @ (point - start)) / max(float(along @ along), 1e-12)
     foot = start + min(max(share, 0.0), 1.0) * along

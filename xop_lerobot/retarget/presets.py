@@ -1,4 +1,4 @@
-"""Presets: whole sets of parameters by name, among them our implementation of the paper's."""
+"""Presets: named sets of planner parameters, one of them our implementation of the paper's."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from xop_lerobot.morphology.tuning import CostWeights, MpcConfig, PaperParameter
 from xop_lerobot.retarget.changes import Settings, make_settings
 from xop_lerobot.retarget.config import PRESETS, RetargeterConfig
 
-_FAR = 1e6  # no goal is further away [m]
+_UNLIMITED = 1e6  # reach that no goal exceeds: goals are not held near [m]
 _PAPER_WEIGHTS = CostWeights(
     position=1.0,
     orientation=1.0,
@@ -35,7 +35,7 @@ _PAPER_WEIGHTS = CostWeights(
 
 
 def _keep(morphology: Morphology, config: MpcConfig, paper: PaperParameters) -> MpcConfig:
-    """Take the robot's own parameters."""
+    """Keep the robot's own parameters."""
     del morphology, paper
     return config
 
@@ -43,40 +43,40 @@ def _keep(morphology: Morphology, config: MpcConfig, paper: PaperParameters) -> 
 def _make_conservative(
     morphology: Morphology, config: MpcConfig, paper: PaperParameters
 ) -> MpcConfig:
-    """Smoother and slower: the part of the paper's w_a = 0.5.
+    """Smoother and slower motion; plays the role of the paper's w_a = 0.5.
 
     The paper's control energy weighs the absolute command, which would pull a standing height
-    down. Here the change of the command costs, the proposal takes its time, and the samples
-    stay near the plan.
+    down. Here changes of the command cost instead, the proposal is slower, and the samples stay
+    closer to the plan.
     """
     del morphology, paper
     weights = dataclasses.replace(config.weights, control=2.0, change=0.5)
-    return _hurry(dataclasses.replace(config, weights=weights), time=2.0, noise=0.5)
+    return _scale_pace(dataclasses.replace(config, weights=weights), time=2.0, noise=0.5)
 
 
 def _make_aggressive(
     morphology: Morphology, config: MpcConfig, paper: PaperParameters
 ) -> MpcConfig:
-    """Faster and rougher: the part of the paper's w_a = 0.02."""
+    """Faster and rougher motion; plays the role of the paper's w_a = 0.02."""
     del morphology, paper
     weights = dataclasses.replace(config.weights, control=0.02, change=0.0)
-    hurried = _hurry(dataclasses.replace(config, weights=weights), time=0.7, noise=1.5)
-    return dataclasses.replace(hurried, full_noise_error=0.5 * config.full_noise_error)
+    faster = _scale_pace(dataclasses.replace(config, weights=weights), time=0.7, noise=1.5)
+    return dataclasses.replace(faster, full_noise_error=0.5 * config.full_noise_error)
 
 
-def _hurry(config: MpcConfig, time: float, noise: float) -> MpcConfig:
-    """Scale the time of the proposal and the width of the samples."""
+def _scale_pace(config: MpcConfig, time: float, noise: float) -> MpcConfig:
+    """Scale the lead time of the proposal and the standard deviation of the samples."""
     noise_std = {name: noise * value for name, value in config.noise_std.items()}
     return dataclasses.replace(config, proposal_s=time * config.proposal_s, noise_std=noise_std)
 
 
 def _make_table1(morphology: Morphology, config: MpcConfig, paper: PaperParameters) -> MpcConfig:
-    """Our implementation of the paper's Table I; its authors' code is not public.
+    """Our implementation of the paper's Table I; the authors' code is not public.
 
-    What the table leaves open is as in pytorch_mppi's KMPPI, which the paper names: half as many
-    support points as steps, a kernel of zero mean and a width of one step, one step of shift,
-    raw weights, the importance-sampling term. No fixed candidates, no observer of the drift, no
-    preview and no extrapolation; a goal far away is not held near.
+    What the table leaves open follows KMPPI of pytorch_mppi, which the paper names: half as many
+    support points as steps, a zero-mean kernel one step wide, a shift by one step, raw weights,
+    and the importance-sampling term. There are no fixed candidates, drift observer, preview or
+    extrapolation, and the distance to the goal is not limited.
     """
     joints = [joint for arm in morphology.arms for joint in arm.joints]
     entries = (*morphology.command_space.names, *joints)
@@ -102,7 +102,7 @@ def _make_table1(morphology: Morphology, config: MpcConfig, paper: PaperParamete
         candidates=(),
         control_reference="zero",
         observe_drift=False,
-        reach=_FAR,
+        reach=_UNLIMITED,
         weights=_PAPER_WEIGHTS,
     )
 
@@ -119,12 +119,12 @@ assert tuple(_MAKERS) == PRESETS
 def build_configs(
     morphology: Morphology, config: RetargeterConfig, settings: Settings | None = None
 ) -> dict[Mode, MpcConfig]:
-    """Build the parameters of each mode: the preset's, then what was set by hand.
+    """Build the parameters of each mode: those of the preset, then manual overrides.
 
     Args:
         morphology: The robot.
-        config: Settings of the session; zeros leave the preset's value.
-        settings: What is in force; by default what `config` starts with.
+        config: Settings of the session; zeros keep the preset's value.
+        settings: Settings in force; by default the initial ones of `config`.
     """
     settings = settings or make_settings(morphology, config)
     variant = morphology.variants[settings.variant]

@@ -1,4 +1,7 @@
-"""The optimal control problem of Eq. 1: the dynamics that are rolled out, and what they cost."""
+"""Optimal control problem of Eq. 1: dynamics (rollouts of the policy in MuJoCo) and cost.
+
+It knows nothing of how the problem is solved; see `mpc.py`.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +28,13 @@ from xop_lerobot.retarget.static_load import make_static_load
 
 
 class Scores(NamedTuple):
-    """What samples cost.
+    """Costs and failures of the samples.
 
     Attributes:
         terms: Cost of every sample by term. Shapes (K,).
-        costs: Their sum; not finite for a sample that diverged. Shape (K,).
-        falls: Which of them fall, or diverge. Shape (K,), bool.
-        touches: Which of them touch an obstacle. Shape (K,), bool.
+        costs: Their sum; not finite for a diverged sample. Shape (K,).
+        falls: Which samples fall or diverge. Shape (K,), bool.
+        touches: Which samples touch an obstacle. Shape (K,), bool.
     """
 
     terms: Mapping[str, np.ndarray]
@@ -41,25 +44,26 @@ class Scores(NamedTuple):
 
 
 class Problem:
-    r"""Eq. 1 without the way it is solved: :math:`\sum_k l(x_k, a_k, G) + V_f(x_H, G)`.
+    r"""Dynamics, constraints and cost :math:`\sum_k l(x_k, a_k, G) + V_f(x_H, G)` of Eq. 1.
 
     The dynamics (1b, 1c) are MuJoCo with the low-level policy and its memory in the loop. The
-    cost-to-go :math:`V_f` is that of an extrapolation beyond the horizon by the `CommandModel`.
+    cost-to-go :math:`V_f` is evaluated at an extrapolation beyond the horizon by the
+    `CommandModel`.
 
     Args:
         morphology: The robot.
         policy: Its low-level policy.
         model: Its planning model in the scene.
-        decision: What is decided.
-        command_model: What a decision does.
+        decision: Layout of the decision vector.
+        command_model: First-order model of the effect of a decision.
         num_threads: Threads of the physics.
-        obstacles: What to keep clear of; by default what is fixed in `model`.
+        obstacles: Obstacles to avoid; by default the geoms that are fixed in `model`.
 
     Attributes:
-        support: Area over which the centre of mass stays; None for a robot that balances itself.
-        load: What joints bear of the weight above them; None where a policy moves them.
-        costs: The terms of the cost.
-        readings: Reads places off predictions.
+        support: Support area for the centre of mass; None for a robot that balances itself.
+        load: Static loads of the joints; None if a policy moves them.
+        costs: The cost terms.
+        readings: Extracts poses and positions from predictions.
     """
 
     def __init__(
@@ -101,30 +105,30 @@ class Problem:
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """What is kept clear of."""
+        """The obstacles to avoid."""
         return self._collision.obstacles.obstacles
 
     def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Keep clear of these and no others."""
+        """Replace the obstacles to avoid."""
         self._collision.set_obstacles(obstacles)
-        # Without obstacles the hull is not read, which saves time.
+        # Without obstacles the hull points are not needed; leaving them out saves time.
         hull = self.morphology.hull_points if obstacles else {}
         self.readings = Readings(self.morphology, self._model, hull)
 
     def restrict(self, decisions: np.ndarray, mode: Mode) -> np.ndarray:
-        """What mode, bounds (1d) and the policy's dead zones leave of decisions. (..., n)."""
+        """Project decisions on the mode, the bounds (1d) and the policy's dead zones. (..., n)."""
         space = self.decision.space
         return space.restrict(space.leave_dead_zones(decisions, mode), mode)
 
     def predict(
         self, state: RobotState, now: PlannerState, decisions: np.ndarray, mode: Mode
     ) -> Prediction:
-        """Roll decisions out, within the rate limits.
+        """Roll out decisions within the rate limits.
 
         Args:
-            state: The robot now: :math:`x_0`, and the memory of its policy (1e, 1f).
-            now: Where it is, with the decision that it executes.
-            decisions: Decisions to try. Shape (K, H, n).
+            state: Present state of the robot: :math:`x_0` and the policy's memory (1e, 1f).
+            now: The planner's state, with the executed decision.
+            decisions: Sampled decisions. Shape (K, H, n).
             mode: Mode of the robot.
         """
         limited = self.command_model.limit_rates(now.executed, decisions, mode, POLICY_DT)
@@ -145,13 +149,13 @@ class Problem:
         mode: Mode,
         config: MpcConfig,
     ) -> Evaluation:
-        """Gather all that the cost terms are computed from.
+        """Collect the quantities that the cost terms are computed from.
 
         Args:
             prediction: The predictions of `decisions`.
-            decisions: What was tried, before the rate limits. Shape (K, H, n).
-            now: Where the robot is, with the decision that it executes.
-            reference: What is to be followed.
+            decisions: Sampled decisions, before the rate limits. Shape (K, H, n).
+            now: The planner's state, with the executed decision.
+            reference: The reference trajectory.
             proposal: The kinematic proposal. Shape (n,).
             mode: Mode of the robot.
             config: Parameters of the mode.
@@ -170,7 +174,7 @@ class Problem:
             offset=now.offset,
             settled=model.settle(now.settled, decisions[:, -1], config.horizon * POLICY_DT),
         )
-        with np.errstate(invalid="ignore"):  # a diverged sample is NaN
+        with np.errstate(invalid="ignore"):  # diverged samples are NaN
             extrapolated = model.extrapolate(end, decisions[:, -1], config.extrapolation_s, mode)
         frames = self.morphology.frames
         sites = {name: frames[name] for name in reference.goals}
@@ -203,8 +207,8 @@ class Problem:
         )
 
     def score(self, evaluation: Evaluation) -> Scores:
-        """Compute what predictions cost."""
-        with np.errstate(invalid="ignore"):  # a diverged sample is NaN, and weighs nothing
+        """Compute the costs of predictions, and which of them fail."""
+        with np.errstate(invalid="ignore"):  # diverged samples are NaN and get no weight
             terms = {cost.name: cost.compute(evaluation) for cost in self.costs}
         costs = np.sum(list(terms.values()), axis=0)
         falls = self._fall.find_falls(evaluation) | ~np.isfinite(costs)

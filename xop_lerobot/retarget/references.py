@@ -1,4 +1,4 @@
-"""What a plan shall follow: the goals over its horizon, where the robot can serve them."""
+"""Reference trajectory of a plan: reachable goal poses over the horizon, and base heading."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from xop_lerobot.retarget.static_load import StaticLoad
 
 
 class Reference(NamedTuple):
-    """What a plan shall follow.
+    """Reference trajectory of a plan.
 
     Attributes:
-        goals: Goal of each tracked frame at `compute_times`. Shapes (H + 3, 7).
-        facing: Where a base on wheels shall face in the end, as in `Evaluation`. Shape (2,).
-        served: The posture for the head's goal, None where there is none.
-        upright: Tracked frames whose hand is to stay level.
+        goals: Goal pose of each tracked frame at `compute_times`. Shapes (H + 3, 7).
+        facing: Desired heading of a wheeled base at the end, as in `Evaluation`. Shape (2,).
+        served: Posture for the head's goal; None if the mode uses none.
+        upright: Tracked frames of hands that are kept level.
     """
 
     goals: Mapping[str, np.ndarray]
@@ -41,16 +41,17 @@ class Reference(NamedTuple):
 
     @property
     def balance(self) -> np.ndarray | None:
-        """Where the centre of mass shall rest on the base; None: as the robot stands. (2,)."""
+        """Desired rest position of the centre of mass on the base; None as standing. (2,)."""
         return None if self.served is None else self.served.balance
 
     def compute_noise_share(self, poses: Mapping[str, np.ndarray], config: MpcConfig) -> float:
-        """Share of the full noise: little at the goal, where fine commands are what counts.
+        """Fraction of the full sampling noise, in proportion to the largest goal error.
 
-        None for a robot that brakes: it does nothing but stop, in the posture it has.
+        Small at the goal, where fine commands matter; zero for a braking robot, which only stops
+        in its present posture.
 
         Args:
-            poses: Tracked frames now. Shapes (7,).
+            poses: Present pose of each tracked frame. Shapes (7,).
             config: Parameters of the mode.
         """
         if self.served is not None and self.served.brakes:
@@ -58,31 +59,31 @@ class Reference(NamedTuple):
         error = 0.0
         for name, track in self.goals.items():
             pose, goal = poses[name], track[config.horizon]
-            cosine = min(abs(float(goal[3:] @ pose[3:])), 1.0)  # of half the angle
+            cosine = min(abs(float(goal[3:] @ pose[3:])), 1.0)  # of half the angle between them
             error = max(error, math.dist(pose[:3], goal[:3]), math.acos(cosine))
         return min(max(error / config.full_noise_error, config.min_noise), 1.0)
 
 
 class References:
-    """Makes the `Reference` of a plan out of the operator's goal.
+    """Makes the `Reference` of a plan from the operator's goal.
 
-    Hands that are to be level get level goals. The head's goal is held where the robot can serve
-    it (`PostureGuide`), and all goals are led over the horizon (`Guidance`).
+    Goals of hands with the upright constraint are levelled, the head's goal is limited to what
+    the robot can reach (`PostureGuide`), and all goals are extended over the horizon (`Guidance`).
 
     Args:
         morphology: The robot.
         model: Its planning model.
-        command_model: What a decision does.
-        support: Area over which the centre of mass stays; None for a robot that balances itself.
-        load: What joints bear of the weight above them; None where a policy moves them.
-        obstacles: What a base on wheels drives around.
+        command_model: First-order model of the effect of a decision.
+        support: Support area for the centre of mass; None for a robot that balances itself.
+        load: Static loads of the joints; None if a policy moves them.
+        obstacles: Obstacles that a wheeled base drives around.
 
     Attributes:
-        readings: Places tracked frames.
-        postures: Which posture serves a goal of the head.
-        guidance: How goals are led over the horizon.
+        readings: Forward kinematics of the tracked frames.
+        postures: Finds the posture for a goal of the head.
+        guidance: Extends goals over the horizon.
         sites: Site of each tracked frame that is followed.
-        upright: Tracked frames whose hand is to stay level.
+        upright: Tracked frames of hands that are kept level.
     """
 
     def __init__(
@@ -107,16 +108,16 @@ class References:
     def configure(
         self, configs: Mapping[Mode, MpcConfig], sites: Mapping[str, str], upright: tuple[str, ...]
     ) -> None:
-        """Take other parameters, tracked frames with their sites, or hands to be kept level."""
+        """Set the parameters, the tracked frames with their sites, and the hands to keep level."""
         self.sites, self.upright = dict(sites), upright
         self.postures.configure(configs, self.sites)
 
     def set_obstacles(self, obstacles: tuple[Obstacle, ...]) -> None:
-        """Drive around these and no others."""
+        """Replace the obstacles to drive around."""
         self._footprint.set_obstacles(obstacles)
 
     def reset(self) -> None:
-        """Start anew."""
+        """Forget previous goals and postures."""
         self.postures.reset()
 
     def compute_poses(self, qpos: np.ndarray) -> dict[str, np.ndarray]:
@@ -134,7 +135,7 @@ class References:
     def serve(
         self, state: PlannerState, goal: Goal, config: MpcConfig
     ) -> tuple[Goal, Served | None]:
-        """The goal where the robot can serve it, and the posture for it."""
+        """Limit the goal to what the robot can reach, and find the posture for it."""
         if HEAD not in self.sites or HEAD not in goal.poses:
             return goal, None
         goal = self.postures.hold(goal, state, config.preview_s)
@@ -149,10 +150,10 @@ class References:
         mode: Mode,
         config: MpcConfig,
     ) -> Reference:
-        """The reference of a robot whose posture has to go another way than nearer and nearer.
+        """Replace the goals if the posture must first move away from the goal.
 
-        Such a plan is led along what the proposal does: goals at which the robot is not yet would
-        pull it back. For all others, `reference` itself.
+        Then they are the poses along the proposal: tracking the goal itself would pull the robot
+        back. Otherwise returns `reference` unchanged.
         """
         served = reference.served
         if served is None or not served.detour:

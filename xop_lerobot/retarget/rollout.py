@@ -1,4 +1,4 @@
-"""Prediction: MuJoCo with the low-level policy in the loop, for a batch of command sequences."""
+"""Batched rollouts of command sequences in MuJoCo with the low-level policy in the loop."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.core.errors import BadShape, BadValue
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 
-_DIVERGED = 1e4  # no position [m, rad] or velocity [m/s, rad/s] of a sound prediction is as large
+_DIVERGED = 1e4  # positions [m, rad] or velocities [m/s, rad/s] beyond this have diverged
 
 
 class Prediction(NamedTuple):
-    """What a batch of rollouts gave.
+    """Result of a batch of rollouts.
 
     Attributes:
-        qpos: Positions at each control step, the first is the start. Shape (K, H + 1, nq).
+        qpos: Positions at each control step; step 0 is the start. Shape (K, H + 1, nq).
         qvel: Velocities at each control step. Shape (K, H + 1, nv).
         commands: The commands that were rolled out. Shape (K, H, k).
-        sensordata: Sensors of the planning model, first at the start, then one physics step
-            before the end of each control step: MuJoCo reads them as a step begins. Shape
-            (K, H + 1, nsensordata).
+        sensordata: Sensors of the planning model at the start, then one physics step before the
+            end of each control step, since MuJoCo evaluates them at the beginning of a step.
+            Shape (K, H + 1, nsensordata).
         memory: The policy's memory at the end. Shape (K, nm).
         policy_s: Time in the low-level policy [s].
         physics_s: Time in MuJoCo [s].
@@ -42,13 +42,13 @@ class Prediction(NamedTuple):
 
 
 class PolicyRollout:
-    """Rolls command sequences out in parallel, one policy call per control step (Eqs. 1b, 1c).
+    """Rolls out command sequences in parallel, one policy call per control step (Eqs. 1b, 1c).
 
     The thread pool lives as long as the object; results do not depend on its size.
 
     Args:
-        model: Planning model; it stays as it is.
-        policy: Low-level policy, whose own motors the rollouts have.
+        model: Planning model; it is not modified.
+        policy: Low-level policy; it adapts the motors of a copy of the model.
         num_threads: Threads of the physics.
 
     Raises:
@@ -56,7 +56,7 @@ class PolicyRollout:
     """
 
     def __init__(self, model: mujoco.MjModel, policy: LowLevelPolicy, num_threads: int) -> None:
-        # MuJoCo would put a diverged sample back to its start, where it looks healthy.
+        # Autoreset would silently restart a diverged sample, which would then look healthy.
         self.model, self.policy = copy.copy(model), policy
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         policy.adapt(self.model)
@@ -66,7 +66,7 @@ class PolicyRollout:
                 f"the policy period {POLICY_DT} s must be a whole multiple of the time step "
                 f"{model.opt.timestep} s"
             )
-        # One thread means the caller's own: a pool of one would only add a hand-over.
+        # nthread=0 runs in the caller's thread; a pool of one thread would only add overhead.
         self._pool = mujoco.rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
         self._data = [mujoco.MjData(model) for _ in range(max(num_threads, 1))]
         self._start = mujoco.MjData(model)
@@ -85,21 +85,24 @@ class PolicyRollout:
         mode: Mode,
         executed: tuple[np.ndarray, np.ndarray, Mode] | None = None,
     ) -> Prediction:
-        """Roll `commands` out from one start state and one policy memory (Eqs. 1e, 1f).
+        """Roll out `commands` from one start state and one policy memory (Eqs. 1e, 1f).
 
         Args:
             qpos: Start position. Shape (nq,).
             qvel: Start velocity. Shape (nv,).
             memory: The policy's memory h at the start. Shape (nm,).
             commands: Command sequences. Shape (K, H, k).
-            arms: Arm and gripper targets: held, or a sequence for each sample. Shape (m,) or
+            arms: Arm and gripper targets, constant or one sequence per sample. Shape (m,) or
                 (K, H, m).
             mode: Mode of the low-level policy.
-            executed: Command, arms and mode executed last, from whose targets a robot that ramps
-                (`Morphology.ramps`) goes to the next in a straight line; None for steps.
+            executed: Command, arms and mode executed last: motor targets are interpolated
+                linearly from theirs, as on a robot with `Morphology.ramps`; None for steps.
 
         Returns:
-            The predicted states; NaN throughout for a sample that diverged.
+            The predicted states; all NaN for a sample that diverged.
+
+        Raises:
+            BadShape: If the policy returns targets of a wrong shape.
         """
         nq, nv = self.model.nq, self.model.nv
         num_rollouts, horizon, _ = commands.shape
@@ -135,7 +138,7 @@ class PolicyRollout:
             else:
                 controls[:] = last[:, None] + shares * (targets - last)[:, None]
                 last = targets
-            # All shapes are as they should be; to check and to tile them takes 0.15 ms a call.
+            # Shapes are known to fit; checking and tiling them would take 0.15 ms per call.
             self._pool.rollout(
                 models,
                 self._data,
@@ -171,7 +174,7 @@ class PolicyRollout:
         memory: np.ndarray,
         executed: tuple[np.ndarray, np.ndarray, Mode],
     ) -> np.ndarray:
-        """Targets of what is executed now. Shape (1, nu)."""
+        """Motor targets of the executed command. Shape (1, nu)."""
         command, arms, mode = executed
         targets, _ = self.policy.act(
             qpos[None], qvel[None], command[None], arms[None], memory[:1], mode
@@ -179,10 +182,10 @@ class PolicyRollout:
         return targets
 
     def _sense(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """Sensors at the start. Shape (nsensordata,)."""
+        """Sensor readings at the start. Shape (nsensordata,)."""
         data = self._start
         data.qpos[:], data.qvel[:] = qpos, qvel
-        # All that sensors of places and velocities need; no contacts, no inertia.
+        # Only the stages that position and velocity sensors need; no contacts, no inertia.
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
         mujoco.mj_sensorPos(self.model, data)

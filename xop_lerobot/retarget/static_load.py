@@ -1,4 +1,4 @@
-"""What joints have to bear of the weight above them, beside what their motors can."""
+"""Static gravity loads of joints relative to the torque limits of their motors."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ from xop_lerobot.morphology.morphology import Morphology
 
 
 class StaticLoad:
-    r"""Torque that holds joints against gravity alone, over the limits of their motors.
+    r"""Torques that hold joints against gravity, divided by the limits of their motors.
 
     .. math:: \tau_i = m_i g\; a_i \cdot ((c_i - p_i) \times e_z)
 
-    with a and p the joint's axis and anchor, m and c the mass and its centre of all that hangs on
-    it. A servo at its limit gives way, and what stands on it folds.
+    with a and p the joint's axis and anchor, m and c mass and centre of mass of the joint's
+    subtree. A servo at its torque limit gives way, and the chain above it folds.
 
     Args:
         model: The robot's model.
-        joints: Joints whose load counts; those whose motor knows no limit are left out.
-        share: Share of a limit up to which a load is nothing [1].
+        joints: Joints whose load counts; those without a torque limit are left out.
+        share: Fraction of the limit up to which a load has no excess [1].
+
+    Attributes:
+        limits: Torque limits [N m]. Shape (n,).
+        joints: Names of the joints that have one.
     """
 
     def __init__(self, model: mujoco.MjModel, joints: Iterable[str], share: float) -> None:
@@ -38,7 +42,8 @@ class StaticLoad:
         self._bodies = model.jnt_bodyid[self._loaded]
         self._moving_bodies = model.jnt_bodyid[self._moving]
         above = _find_ancestors(model)
-        # Who turns all that hangs on a joint, and who only part of it.
+        # Whether hinge j moves the whole subtree of loaded joint i (j is i, or between i and the
+        # root), or only a part of it (j is inside the subtree).
         self._carries = above[np.ix_(self._bodies, self._moving_bodies)]
         self._hangs = above[np.ix_(self._moving_bodies, self._bodies)].T & ~self._carries
         mass = model.body_subtreemass
@@ -46,13 +51,13 @@ class StaticLoad:
         self._part = mass[self._moving_bodies] / mass[self._bodies][:, None]
 
     def compute(self, data: mujoco.MjData) -> np.ndarray:
-        """Torques over their limits, signed, once all bodies are placed [1]. Shape (n,)."""
+        """Signed torques over their limits, after `mj_comPos` [1]. Shape (n,)."""
         arm, axis = self._compute_arms(data)
         torque = self._weight * (axis[:, 0] * arm[:, 1] - axis[:, 1] * arm[:, 0])
         return torque / self.limits
 
     def compute_excess(self, qpos: np.ndarray) -> np.ndarray:
-        """Loads beyond their share in some configurations [1]. (m, nq) -> (m, n)."""
+        """Loads beyond their `share` in a batch of configurations [1]. (m, nq) -> (m, n)."""
         data, load = self._data, np.empty((len(qpos), len(self.joints)))
         for i, configuration in enumerate(qpos):
             data.qpos[:] = configuration
@@ -66,9 +71,9 @@ class StaticLoad:
         return data.subtree_com[self._bodies] - data.xanchor[loaded], data.xaxis[loaded]
 
     def linearise_excess(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        r"""Compute the loads beyond their share, and the derivative by :math:`\dot q`.
+        r"""Compute the loads beyond their `share`, and their derivative by :math:`\dot q`.
 
-        Shapes (n,), (n, nv).
+        Shapes (n,), (n, nv). Needs `mj_comPos` first.
         """
         load = self.compute(data)
         excess = np.abs(load) - self.share
@@ -84,7 +89,7 @@ class StaticLoad:
         arm, axis = self._compute_arms(data)
         turning = data.xaxis[self._moving]  # (m, 3)
         own = data.subtree_com[self._moving_bodies] - data.xanchor[self._moving]
-        part = _cross_level(turning, own)  # how fast the mass on each hinge goes
+        part = _cross_level(turning, own)  # velocity of the mass above each hinge
         arm_by = np.where(self._carries, _cross_level(turning, arm[:, None]), 0.0)
         arm_by += self._hangs * self._part * part[:, None]
         axis_by = np.where(self._carries, _cross_level(turning, axis[:, None]), 0.0)
@@ -104,7 +109,7 @@ def _cross_level(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def make_static_load(morphology: Morphology, model: mujoco.MjModel) -> StaticLoad | None:
-    """What the servos of a stiff body bear; None where a policy moves the body."""
+    """Static loads of the servos of a stiff body; None if a policy moves the body."""
     if morphology.servos is None:
         return None
     joints = [effect.joint for effect in morphology.effects if effect.joint]
@@ -122,7 +127,7 @@ def _find_limits(model: mujoco.MjModel) -> dict[int, float]:
 
 
 def _find_ancestors(model: mujoco.MjModel) -> np.ndarray:
-    """Whether the second body is the first one or above it. Shape (nbody, nbody), bool."""
+    """Mask [i, j]: body j is body i or one of its ancestors. Shape (nbody, nbody), bool."""
     above = np.eye(model.nbody, dtype=bool)
     for body in range(1, model.nbody):
         above[body] |= above[model.body_parentid[body]]

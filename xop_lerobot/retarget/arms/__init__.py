@@ -1,1 +1,1 @@
-"""Arms that follow the wrists: inverse kinematics, and what they do in contact."""
+"""Arm control: wrist goals, inverse kinematics, and behaviour in contact."""

@@ -1,8 +1,8 @@
-"""Arms in contact: loads on the hands, a bimanually held object, and hands that squeeze too hard.
+"""Arms in contact: force estimation, bimanual holding, compliance, and steady-state correction.
 
-`ArmLoad` estimates contact forces from the torques of the arms, `ArmHold` keeps an object that both
-hands hold fixed relative to the body, `ArmYield` gives way to too much force; `ArmBias` observes
-by how much arms miss their targets, and corrects it slowly.
+`ArmLoad` estimates contact forces from arm torques, `ArmHold` keeps a bimanually held object fixed
+relative to the body, `ArmYield` limits the squeezing force, and `ArmBias` observes and corrects the
+steady-state error of the arm joints.
 """
 
 from __future__ import annotations
@@ -24,43 +24,43 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.morphology.morphology import Morphology
 
 HELD = (4.0, 2.0)
-"""Force of either hand towards the other from which something is held, and below which it is not
-any more [N]."""
+"""Forces of the hands towards each other at which holding begins and ends (hysteresis) [N]."""
 CARRYING_S, HOLDING_S, FREE_S = 1.5, 0.6, 0.1
-"""Time constants with which hands that carry something, that hold it, and free ones take up where
-they shall be against the body [s]; free hands that have once done so are not smoothed at all."""
+"""Time constants of the goals relative to the body: hands that hold an object in mobile mode, in
+stationary mode, and hands that have released it [s]."""
 CAUGHT_UP = 0.003
-"""Free hands so near to their goals are no longer smoothed [m]."""
+"""Distance of free hands from their goals at which the smoothing ends [m]."""
 
 
 class ArmHold:
-    """Smooths the goals of hands that press on each other, as seen from the robot's head.
+    """Smooths the goals of hands that hold an object between them, relative to the robot's head.
 
-    A robot that walks sways by centimetres. Hands that stay where they are in the world all the
-    while have to swing against the body, neither of them quite in time, and shear what is between
-    them until it slips. So their goals against the body change slowly while something is held;
-    what they hold sways with the body.
+    A walking robot sways by centimetres. Hands that are fixed in the world have to move against
+    that sway, never quite in phase, and shear the object between them until it slips. So while an
+    object is held, their goals relative to the body change slowly, and the object sways with the
+    body.
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Hold nothing."""
+        """Forget a held object."""
         self.is_holding = False
         self.squeeze = 0.0
-        """Force of either hand towards the other, the smaller of both [N]."""
+        """Squeezing force: the smaller of the forces of the hands towards each other [N]."""
         self._poses: dict[str, np.ndarray] = {}
 
     def update(self, forces: np.ndarray, across: np.ndarray) -> None:
-        """Find out whether something is held.
+        """Detect whether an object is held.
 
         Args:
-            forces: Of the left and the right hand on what they touch, world [N]. Shape (2, 3).
-            across: From the left hand to the right one [m]. Shape (3,).
+            forces: Forces of the left and the right hand on the environment, world axes [N].
+                Shape (2, 3).
+            across: Vector from the left to the right hand [m]. Shape (3,).
         """
-        way = across / max(float(np.linalg.norm(across)), 1e-6)
-        self.squeeze = min(float(forces[0] @ way), -float(forces[1] @ way))
+        direction = across / max(float(np.linalg.norm(across)), 1e-6)
+        self.squeeze = min(float(forces[0] @ direction), -float(forces[1] @ direction))
         self.is_holding = self.squeeze > (HELD[1] if self.is_holding else HELD[0])
 
     def smooth(
@@ -72,13 +72,14 @@ class ArmHold:
         *,
         walking: bool = False,
     ) -> dict[str, np.ndarray]:
-        """Smooth the goals as the hands need it.
+        """Smooth the goals while an object is held, and briefly after its release.
 
         Args:
             goals: Wrist poses in the world. Shapes (7,).
-            head: Pose of the robot's head that they belong to. Shape (7,).
-            steady_head: Pose of the head of the body that the arms are computed for. What is
-                smoothed is put back to there; it would tremble by the difference. Shape (7,).
+            head: Measured pose of the robot's head. Shape (7,).
+            steady_head: Pose of the head in the filtered configuration that the arms are solved
+                for. Smoothed goals are attached to it, as they would tremble with the noise of
+                `head` otherwise. Shape (7,).
             dt: Time since the last tick [s].
             walking: Whether the robot may be walking.
 
@@ -87,7 +88,7 @@ class ArmHold:
         """
         back = pose_inverse(head)
         local = {name: pose_multiply(back, pose) for name, pose in goals.items()}
-        if not self.is_holding and self._poses.keys() != local.keys():
+        if not self.is_holding and self._poses.keys() != local.keys():  # nothing was held before
             self._poses = {}
             return dict(goals)
         held_s = CARRYING_S if walking else HOLDING_S
@@ -106,28 +107,28 @@ class ArmHold:
 
 
 class ArmBias:
-    r"""Observes the offset of each arm joint from its target, to send targets without it.
+    r"""Observes the steady-state offset of each arm joint from its target, and compensates it.
 
-    A learned low-level policy moves the arms beside their targets to keep its balance, by 0.2
-    rad with the hands forward, and servos sag. Per joint, with :math:`s` the target that was
-    executed and :math:`q` the measured angle,
+    To keep its balance, a learned low-level policy moves the arms off their targets, by 0.2 rad
+    with the hands forward; servos sag. Per joint, with :math:`s` the executed target and :math:`q`
+    the measured angle,
 
     .. math:: b \leftarrow b + (1 - e^{-dt/\tau})\,(q - s - b), \qquad |b| \le b_{max},
 
-    and the target to send for a wanted angle :math:`q^*` is :math:`q^* - b` within the joint's
-    limits. It is an observer of the plant's own offset, not an integral of the tracking error:
-    nothing winds up at a limit or at a goal out of reach.
+    and the target to send for a desired angle :math:`q^*` is :math:`q^* - b` within the joint's
+    limits. It is a disturbance observer, not an integral of the tracking error: nothing winds up
+    at a limit or at an unreachable goal.
 
-    While the arms move, :math:`q - s` is lag and swing, no offset; so nothing is learned until
-    the wanted angles of all joints, smoothed against noise, have been slow for a while.
+    While the arms move, :math:`q - s` is lag and swing rather than offset. So nothing is learned
+    until the low-passed speeds of all desired angles have been small for a while.
 
     Args:
         joint_range: Limits of the joints [rad]. Shape (n, 2).
         time_constant: τ [s].
-        max_bias: Largest offset that is taken out [rad].
-        max_speed: Speed of a wanted angle from which on nothing is learned [rad/s].
-        smoothing: Time constant over which that speed is smoothed [s].
-        rest_s: For how long the arms must have been slow [s].
+        max_bias: Largest offset that is compensated [rad].
+        max_speed: Speed of a desired angle above which nothing is learned [rad/s].
+        smoothing: Time constant of the low-pass filter of that speed [s].
+        rest_s: Time for which the arms must have been slow [s].
     """
 
     def __init__(
@@ -146,23 +147,23 @@ class ArmBias:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the offsets."""
+        """Set the offsets to zero."""
         self.bias = np.zeros(len(self.joint_range))
-        """The offsets now [rad]. Shape (n,)."""
+        """Estimated offsets [rad]. Shape (n,)."""
         self._velocity = np.zeros(len(self.joint_range))
         self._slow_s = 0.0
 
     def update(
         self, offset: np.ndarray, moved: np.ndarray, dt: float, free: np.ndarray | None = None
     ) -> None:
-        """Learn from one tick.
+        """Update the offsets by one tick.
 
         Args:
             offset: Measured angles less the targets executed last, q − s [rad]. Shape (n,).
-            moved: How far the wanted angles have moved since the last update [rad]. Shape (n,).
-            dt: Time since then [s]; without any, nothing is learned.
-            free: Factor on the rate at which each joint learns, 1 for a free arm, 0 for one that
-                presses as hard as it may. Shape (n,).
+            moved: Change of the desired angles since the last update [rad]. Shape (n,).
+            dt: Time since the last update [s]; nothing is learned if it is not positive.
+            free: Factor on the learning rate of each joint, 1 for an arm in free space, 0 for one
+                in firm contact; 1 by default. Shape (n,).
         """
         if dt <= 0:
             return
@@ -177,24 +178,24 @@ class ArmBias:
         self.bias = np.clip(bias, -self.max_bias, self.max_bias)
 
     def compute_targets(self, wanted: np.ndarray) -> np.ndarray:
-        """Targets [rad] that bring the joints to `wanted` [rad]. Shapes (n,)."""
+        """Targets that bring the joints to the angles `wanted` [rad]. Shapes (n,)."""
         return np.clip(wanted - self.bias, *self.joint_range.T)
 
 
 class ArmLoad:
     r"""Estimates the force on each wrist from the measured torques of its arm.
 
-    In slow motion the torques τ of an arm carry its weight g(q) and whatever presses on the hand.
-    With J the translational Jacobian of the wrist over the arm's joints, the force of the hand on
-    what it touches is the least-squares solution of
+    In slow motion the torques τ of an arm balance gravity g(q) and the contact force. With J the
+    translational Jacobian of the wrist by the arm's joints, the force of the hand on the
+    environment is the least-squares solution of
 
     .. math:: J^T f = \tau - g(q),
 
-    smoothed over a while, since friction and swing are in the torques, too.
+    low-passed, since the torques also contain friction and swing.
 
     Args:
         morphology: The robot.
-        smoothing: Time constant [s].
+        smoothing: Time constant of the low-pass filter [s].
     """
 
     def __init__(self, morphology: Morphology, smoothing: float = 0.3) -> None:
@@ -212,22 +213,22 @@ class ArmLoad:
             self._arms.append((site, dofs, np.array([driven.index(joint.id) for joint in joints])))
         ends = np.cumsum([0, *(len(arm.joints) for arm in morphology.arms)])
         self.parts = tuple(slice(*pair) for pair in pairwise(ends.tolist()))
-        """Which joints of all arms each arm has."""
+        """Slice of each arm's joints among those of all arms."""
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was felt."""
+        """Set the forces to zero."""
         self.force = np.zeros((len(self._arms), 3))
-        """Force of each hand on what it touches, world axes [N]. Shape (arms, 3)."""
+        """Force of each hand on the environment, world axes [N]. Shape (arms, 3)."""
 
     def update(self, qpos: np.ndarray, effort: np.ndarray, dt: float) -> None:
-        """Feel once.
+        """Update the forces by one measurement.
 
         Args:
             qpos: Measured configuration. Shape (nq,).
-            effort: Measured forces of all actuators [N m or N]. Shape (nu,). Of a robot that
-                measures none, all zero, nothing is felt.
-            dt: Time since the last update [s]; without any, nothing is felt.
+            effort: Measured forces of all actuators [N m or N]; all zero from a robot without
+                torque measurement, which then estimates no force. Shape (nu,).
+            dt: Time since the last update [s]; ignored if it is not positive.
         """
         if dt <= 0 or not effort.any():
             return
@@ -236,57 +237,58 @@ class ArmLoad:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         weight = np.zeros(model.nv)
-        mujoco.mj_rne(model, data, 0, weight)
+        mujoco.mj_rne(model, data, 0, weight)  # at zero velocity: gravity alone
         share = -np.expm1(-dt / self.smoothing)
         for i, (site, dofs, actuators) in enumerate(self._arms):
             mujoco.mj_jacSite(model, data, self._jacobian, None, site)
             torque = effort[actuators] - weight[dofs]
+            # rcond drops directions in which a nearly singular arm cannot measure force.
             force = np.linalg.lstsq(self._jacobian[:, dofs].T, torque, rcond=0.1)[0]
             self.force[i] += share * (force - self.force[i])
 
 
-MOST_SQUEEZE = 60.0
-"""Hands that squeeze harder than so give way [N]: enough for a box of 4 kg with a friction of 0.7
-that is accelerated by 0.1 g, and within what the wrists of both robots can do."""
+MAX_SQUEEZE = 60.0
+"""Squeezing force above which the hands yield [N]: enough for a 4 kg box with a friction of 0.7
+that is accelerated by 0.1 g, and within the wrist torques of G1 and RB-Y1."""
 GAIN = 2e-4
-"""How fast a hand gives way per newton over the limit [m/s/N]. With arms of up to 10 N/mm and a
-force that is felt 0.3 s late, this comes to rest within about a second, without swinging."""
-MOST_WAY = 0.06
-"""Farthest that a hand gives way [m]."""
+"""Yielding speed per newton above the limit [m/s/N]. With arms of up to 10 N/mm and a force
+estimate that lags by 0.3 s, the hands settle within about a second, without oscillation."""
+MAX_YIELD = 0.06
+"""Largest displacement of a yielding hand [m]."""
 
 
 class ArmYield:
-    r"""Moves the goals of both hands apart while they squeeze what is between them too hard.
+    r"""Admittance of two hands that squeeze an object too hard: moves their goals apart.
 
-    Nobody feels through a headset how hard a robot presses. Arms on stiff servos turn a
-    centimetre into a hundred newtons: their wrists reach their largest torque, bend, and let go.
-    So each hand gives way by w against the other,
+    The operator of a headset does not feel how hard the robot presses. On stiff servos a
+    centimetre means a hundred newtons: the wrists reach their torque limits, bend, and let go. So
+    each hand is displaced away from the other by w,
 
     .. math:: \dot w = k (F - F_{max}), \quad 0 \le w \le w_{max},
 
-    with F the force with which they squeeze. Who squeezes less gets no help: w is never negative.
+    with F the squeezing force. w is never negative: a weak grip is not tightened.
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Give way no more."""
-        self.way = 0.0
-        """How far each hand has given way [m]."""
+        """Set the displacement to zero."""
+        self.displacement = 0.0
+        """Present displacement w of each hand [m]."""
 
     def update(self, squeeze: float, dt: float) -> None:
-        """Take up how hard the hands squeeze.
+        """Update the displacement.
 
         Args:
-            squeeze: Force of either hand towards the other [N].
+            squeeze: Squeezing force [N].
             dt: Time since the last update [s].
         """
-        way = self.way + GAIN * dt * (squeeze - MOST_SQUEEZE)
-        self.way = float(np.clip(way, 0.0, MOST_WAY))
+        displacement = self.displacement + GAIN * dt * (squeeze - MAX_SQUEEZE)
+        self.displacement = float(np.clip(displacement, 0.0, MAX_YIELD))
 
     def part(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Move the places of the left and the right hand apart [m]. Shapes (3,)."""
+        """Move the positions of the left and the right hand apart [m]. Shapes (3,)."""
         across = right - left
-        way = self.way * across / max(float(np.linalg.norm(across)), 1e-6)
-        return left - way, right + way
+        shift = self.displacement * across / max(float(np.linalg.norm(across)), 1e-6)
+        return left - shift, right + shift

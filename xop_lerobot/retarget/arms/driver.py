@@ -1,14 +1,13 @@
-"""Arms and grippers of one tick: by inverse kinematics, or as the plan has decided.
+"""Targets of arms and grippers for one tick, by inverse kinematics or from the plan.
 
-Wrist goals are relative to the head where the body is not where the head's goal is
-(`compute_wrist_goals`); `ServoFilter` takes the noise of encoders out of joints on stiff servos.
+`ArmDriver` is the entry point. `compute_wrist_goals` moves wrist goals with a head that is off its
+own goal; `ServoFilter` removes encoder noise from the joints of stiff servos below the arms.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -30,11 +29,6 @@ from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arms.contact import ArmBias, ArmHold, ArmLoad, ArmYield
 from xop_lerobot.retarget.arms.ik import ARM_MAX_DT, ARM_MAX_RATE, ArmIk
 
-if TYPE_CHECKING:
-    import mujoco
-
-    from xop_lerobot.morphology.morphology import Morphology
-
 
 def compute_wrist_goals(
     goals: Mapping[str, np.ndarray],
@@ -44,16 +38,16 @@ def compute_wrist_goals(
 ) -> dict[str, np.ndarray]:
     """Move wrist goals along with a head that is not at its goal.
 
-    A hand that works must be where the operator's is in the world, whatever the head does; a
+    A working hand must be where the operator's is in the world, whatever the head does; but a
     robot that walks half a metre behind its goal must not stretch its arms ahead of itself. So
-    the goal in the world holds while it is within `max_offset` and `max_turn` of the goal that
-    goes with the robot's own head, and is held at that distance beyond. The change is continuous.
+    the goal in the world applies within `max_offset` and `max_turn` of the goal relative to the
+    robot's own head, and is clamped to that distance beyond, without a discontinuity.
 
     Args:
         goals: Goal poses in the world by tracked frame. Shapes (7,).
-        head: The robot's head now. Shape (7,).
-        max_offset: Distance up to which the goal in the world holds [m].
-        max_turn: Turn up to which it holds [rad].
+        head: Present pose of the robot's head. Shape (7,).
+        max_offset: Distance up to which the goal in the world applies [m].
+        max_turn: Angle up to which it applies [rad].
 
     Returns:
         Goals of every frame but the head. Shapes (7,).
@@ -69,7 +63,7 @@ def compute_wrist_goals(
 
 
 def _approach(start: np.ndarray, end: np.ndarray, max_offset: float, max_turn: float) -> np.ndarray:
-    """Go from one pose towards another, at most so far. Shape (7,)."""
+    """Move from one pose towards another by at most a distance and an angle. Shape (7,)."""
     offset = end[:3] - start[:3]
     turn = rotation_error(end[3:], start[3:])
     offset *= min(1.0, max_offset / max(float(np.linalg.norm(offset)), 1e-9))
@@ -78,15 +72,14 @@ def _approach(start: np.ndarray, end: np.ndarray, max_offset: float, max_turn: f
 
 
 class ServoFilter:
-    r"""Estimates where servos hold their joints, from what they were told and where they are seen.
+    r"""Estimates the angles of servos from their targets and noisy encoders.
 
-    A stiff servo follows its target s as a first-order lag, :math:`\dot m = (s - m)/T`, but for
-    an offset that changes slowly, such as a sag. So of the measured angle q only the slow part of
-    what the lag does not explain is believed,
+    A stiff servo follows its target s with a first-order lag, :math:`\dot m = (s - m)/T`, up to a
+    slowly changing offset b such as sag, which is observed from the measured angle q:
 
     .. math:: b \leftarrow b + (1 - e^{-dt/\tau})(q - m - b), \qquad \hat q = m + b.
 
-    White noise of q is damped by :math:`\sqrt{dt/2\tau}`, and no motion that was asked for is late.
+    White noise of q is reduced by :math:`\sqrt{dt/2\tau}`, and commanded motion is not delayed.
 
     Args:
         lag: T of each joint [s]. Shape (n,).
@@ -98,17 +91,17 @@ class ServoFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew from the next measurement."""
+        """Restart from the next measurement."""
         self._model: np.ndarray | None = None
         self._offset = np.zeros(len(self.lag))
 
     def update(self, targets: np.ndarray, angles: np.ndarray, dt: float) -> np.ndarray:
-        """Estimate the angles of now.
+        """Estimate the present angles.
 
         Args:
-            targets: What the servos have been told since the last update [rad]. Shape (n,).
-            angles: Measured [rad]. Shape (n,).
-            dt: Time since then [s].
+            targets: Targets of the servos since the last update [rad]. Shape (n,).
+            angles: Measured angles [rad]. Shape (n,).
+            dt: Time since the last update [s].
 
         Returns:
             Estimated angles [rad]. Shape (n,).
@@ -123,11 +116,11 @@ class ServoFilter:
 
 
 class SteadyBody:
-    """The configuration that the arms hang on, with the joints of stiff servos filtered.
+    """Configuration of the body below the arms, with the joints of stiff servos filtered.
 
     Args:
-        morphology: The robot; says whether its body is on stiff servos.
-        model: Any model of it, to find the joints.
+        morphology: The robot; `servos` tells whether its body is on stiff servos.
+        model: Any model of it, for the addresses of the joints.
     """
 
     def __init__(self, morphology: Morphology, model: mujoco.MjModel) -> None:
@@ -139,15 +132,15 @@ class SteadyBody:
         self._filter = ServoFilter(np.array([effects[i].lag_s for i in held]))
 
     def reset(self) -> None:
-        """Start anew from the next configuration."""
+        """Restart from the next configuration."""
         self._filter.reset()
 
     def update(self, qpos: np.ndarray, command: np.ndarray, dt: float) -> np.ndarray:
-        """Return the configuration of now.
+        """Return the filtered configuration.
 
         Args:
-            qpos: As measured. Shape (nq,).
-            command: Command that is executed. Shape (k,).
+            qpos: Measured configuration. Shape (nq,).
+            command: Command being executed. Shape (k,).
             dt: Time since the last update [s].
         """
         if not len(self._address):
@@ -159,25 +152,26 @@ class SteadyBody:
 
 
 BIAS_TIME = 1.5
-"""Time in which offsets of the arms are learned [s]. With 0.5 s the arms of G1, which are soft,
-swing a box that they hold between them."""
+"""Time constant of the arm offsets [s]. With 0.5 s the soft arms of G1 oscillate with a box that
+they hold."""
 PRESSING = (5.0, 15.0)
-"""Force of a hand from which its arm's offsets are learned more slowly, and no more [N]. What a
-hand presses against keeps it from its goal; taken for an offset, the press would grow until
-`max_bias`, to 100 N with G1, and bend wrists and whole robot aside."""
+"""Contact forces from which the offsets of an arm are learned more slowly, and no longer [N]. A
+contact keeps the hand from its goal; taken for an offset, it would make the force grow until
+`max_bias` is reached, to 100 N on G1, and bend the wrists and the whole robot."""
 
 
 class ArmDriver:
-    """Computes arm targets, and knows the last ones so that they go on without a step.
+    """Computes continuous arm targets from goals and plan.
 
-    Arms of which the plan decides a joint are left out of the inverse kinematics. When that
-    changes, when somebody else has driven the arms, and at an engagement, it starts anew from
-    the targets that are executed.
+    Arms with a joint that the plan decides are excluded from the inverse kinematics. When the set
+    of these joints changes, when the arms were driven by another source, and on engagement, it
+    restarts from the executed targets, so that they never step.
 
     Args:
         morphology: The robot.
-        holds_place: Whether the body is brought to where its goal is (`Retargeter.holds_place`).
-        arm_limits: Angles that the robot's low-level policy keeps arm joints within [rad].
+        holds_place: Whether the retargeter closes the loop on the position of the head
+            (`Retargeter.holds_place`).
+        arm_limits: Joint limits of the arms imposed by the low-level policy [rad].
     """
 
     def __init__(
@@ -200,12 +194,12 @@ class ArmDriver:
         self.forget()
 
     def forget(self) -> None:
-        """Start anew from the executed targets at the next tick."""
+        """Restart from the executed targets at the next tick."""
         self._wanted = self._sent = np.zeros(0)
         self._decided: frozenset[str] = frozenset()
 
     def note(self, arms: np.ndarray) -> None:
-        """Take down the targets that were sent. Shape (m,)."""
+        """Record the targets that were sent. Shape (m,)."""
         self._sent = arms[: self.ik.num_joints]
 
     def compute(
@@ -219,8 +213,8 @@ class ArmDriver:
         """Compute the targets of arms and grippers.
 
         Args:
-            state: The robot now.
-            goal: Goals of the wrists and how far the hands are closed.
+            state: Present state of the robot.
+            goal: Goals of wrists and grippers.
             head: Pose of the robot's head. Shape (7,).
             decided: Targets of the joints that the plan decides [rad].
             dt: Time since the last tick [s].
@@ -238,7 +232,7 @@ class ArmDriver:
             self.giving.reset()
         self._decided = frozenset(decided)
         self.load.update(state.qpos, state.effort, dt)
-        # What the encoders of the body tremble by, the hands would make up for in earnest.
+        # With raw encoders of the body, the hands would visibly compensate their noise.
         body = self._body.update(state.qpos, state.command, dt)
         wrists = self._find_wrists(goal, head, body, dt)
         last, wanted = self._wanted, self.ik.solve(body, self._wanted, wrists, dt)
@@ -251,25 +245,25 @@ class ArmDriver:
         self._wanted = wanted
         offset = state.qpos[self.ik.qpos_address] - executed
         self.bias.update(offset, wanted - last, dt, self._compute_freedom())
-        # The plan's prediction has the offset of the low-level policy in it.
+        # No bias on planned joints: the policy's offset is part of the plan's prediction.
         targets = np.where(planned, wanted, self.bias.compute_targets(wanted))
         return np.concatenate([targets, self.compute_grippers(goal)])
 
     def _find_wrists(
         self, goal: Goal, head: np.ndarray, body: np.ndarray, dt: float
     ) -> dict[str, np.ndarray]:
-        """Where the wrists shall be in the world. Shapes (7,)."""
+        """Goal poses of the wrists in the world, after contact behaviour. Shapes (7,)."""
         goals = self._find_ik_goals(goal)
         hands = [arm.frame for arm in self.morphology.arms if arm.frame in goals]
-        if len(hands) != 2:  # a left and a right hand
+        if len(hands) != 2:  # bimanual behaviour needs a left and a right hand
             return compute_wrist_goals(goals, head)
         left, right = hands
         walking = goal.mode is Mode.MOBILE
         self.hold.update(self.load.force, goals[right][:3] - goals[left][:3])
         self.giving.update(self.hold.squeeze, dt)
         if not self.holds_place or (self.hold.is_holding and walking):
-            # What is carried goes with the body, however far that is from its goal: arms that
-            # stretch aside shear what is between them.
+            # A carried object moves with the body, however far that is from its goal: stretching
+            # the arms sideways would shear the object.
             wrists = compute_wrist_goals(goals, head, max_offset=0.0, max_turn=0.0)
         else:
             wrists = compute_wrist_goals(goals, head)
@@ -294,7 +288,7 @@ class ArmDriver:
         return make_pose(site.xpos, quat_from_matrix(site.xmat.reshape(3, 3)))
 
     def _compute_freedom(self) -> np.ndarray:
-        """How freely each joint's arm moves, from 1 down to 0 for one that presses. Shape (n,)."""
+        """Factor on the learning rate of each joint: 1 in free space, 0 in contact. (n,)."""
         freedom = np.ones(self.ik.num_joints)
         gentle, hard = PRESSING
         for part, force in zip(self.load.parts, self.load.force, strict=True):
@@ -302,7 +296,7 @@ class ArmDriver:
         return freedom
 
     def _find_ik_goals(self, goal: Goal) -> dict[str, np.ndarray]:
-        """Goals without those of the arms that the plan decides."""
+        """Goals except those of arms that the plan decides."""
         taken = {
             arm.frame for arm in self.morphology.arms if not self._decided.isdisjoint(arm.joints)
         }

@@ -1,4 +1,4 @@
-"""Arm inverse kinematics: the wrists follow the operator's, whatever the body does."""
+"""Differential inverse kinematics of the arms, by mink."""
 
 from __future__ import annotations
 
@@ -12,27 +12,25 @@ import numpy as np
 from xop_lerobot.morphology.morphology import Morphology
 
 ARM_MAX_RATE = 3.0
-"""Largest speed of arm targets, whoever decides them [rad/s]."""
+"""Largest speed of arm targets, from inverse kinematics or plan [rad/s]."""
 ARM_MAX_DT = 0.05
-"""After a stall the arms move as after one late tick, not all at once [s]."""
+"""Upper bound of the time step, so that the arms do not lurch after a stall [s]."""
 
 
 class ArmIk:
-    """Differential inverse kinematics of the arms with mink, the rest of the body as measured.
+    """Moves the arms towards wrist goals, with the rest of the body fixed as measured.
 
-    Each solve starts from its own last solution, not from the measured arms, so that sensor
-    noise and sagging never reach it. Joint limits and a joint speed limit hold by construction.
-    It keeps elbows, forearms and hands a distance from the rest of the body, except for what the
-    servo lag adds, and for what a single step misses, since each holds the distance to first
-    order only.
-    The posture term pulls weakly towards the rest angles and keeps the elbows from drifting
-    through the null space.
+    Each solve starts from its own last solution, not from the measured arms, so that sensor noise
+    and sag do not enter. Joint limits and a speed limit hold by construction. Elbows, forearms and
+    hands keep a distance from the rest of the body, to first order per step and up to the servo
+    lag. A weak posture task pulls towards the rest angles and keeps the elbows from drifting in
+    the null space.
 
     Args:
         morphology: The robot.
         max_speed: Speed limit of the arm joints [rad/s].
         iterations: Steps per solve.
-        arm_limits: Angles to keep joints within besides the morphology's [rad].
+        arm_limits: Joint limits in addition to those of the morphology [rad].
     """
 
     def __init__(
@@ -47,7 +45,7 @@ class ArmIk:
         joints = [joint for arm in morphology.arms for joint in arm.joints]
         self.num_joints = len(joints)
         self.qpos_address = np.array([int(model.joint(joint).qposadr[0]) for joint in joints])
-        """Where the arm joints are in the robot's qpos. Shape (num_joints,), int."""
+        """Addresses of the arm joints in the robot's qpos. Shape (num_joints,), int."""
         self.joint_range = np.array([model.joint(joint).range for joint in joints])
         """Limits of the arm joints [rad]. Shape (num_joints, 2)."""
         for joint, (low, high) in (*morphology.arm_limits.items(), *arm_limits.items()):
@@ -73,7 +71,7 @@ class ArmIk:
         self._rest = rest
         self._dofs = np.array(dofs)
         frames = [arm.frame for arm in morphology.arms for _ in arm.joints]
-        self._owner = np.array(frames)  # frame that each joint's arm carries
+        self._owner = np.array(frames)  # tracked frame of each joint's arm
         self._freezing: dict[frozenset[str], mink.DofFreezingTask] = {}
         self._limits = [
             mink.ConfigurationLimit(model, gain=0.5),
@@ -89,7 +87,7 @@ class ArmIk:
         self._limited = model.jnt_qposadr[limited]
         self._range = model.jnt_range[limited]
         self.failures = 0
-        """Number of solves that the quadratic program failed; the arms then stay."""
+        """Number of failed quadratic programs; the arms then keep their targets."""
 
     def solve(
         self,
@@ -103,8 +101,8 @@ class ArmIk:
         Args:
             qpos: Configuration of the robot; its arm angles are not used. Shape (nq,).
             arms: The last solution [rad]. Shape (num_joints,).
-            goals: Wanted pose in the world of each wrist; arms without a goal stay. Shapes (7,).
-            dt: Time since the last solve [s]; without any, nothing moves.
+            goals: Desired pose of each wrist in the world; arms without a goal stay. Shapes (7,).
+            dt: Time since the last solve [s]; nothing moves if it is not positive.
 
         Returns:
             New angles within the limits. Shape (num_joints,).
@@ -120,7 +118,7 @@ class ArmIk:
         moving = np.isin(self._owner, list(goals))
         q = qpos.copy()
         q[self.qpos_address] = arms
-        # A frozen joint measured beyond its limit would leave the program no solution.
+        # A frozen joint measured beyond its limit would make the program infeasible.
         q[self._limited] = np.clip(q[self._limited], *self._range.T)
         rest = q.copy()
         rest[self.qpos_address] = self._rest
@@ -145,7 +143,7 @@ class ArmIk:
         return np.where(moving, self._configuration.q[self.qpos_address], arms)
 
     def _freeze(self, moving: np.ndarray) -> mink.DofFreezingTask:
-        """Constraint that holds all but the arm joints that move. Shape (num_joints,), bool."""
+        """Constraint that freezes all joints but the `moving` arm joints, (num_joints,), bool."""
         owners = frozenset(self._owner[moving])
         if owners not in self._freezing:
             model = self._configuration.model
@@ -155,12 +153,12 @@ class ArmIk:
 
 
 def _find_pairs(model: mujoco.MjModel, morphology: Morphology) -> list[tuple[list[int], list[int]]]:
-    """Colliding geoms of each arm from the elbow on, against those of the rest of the body."""
+    """Pairs of colliding geoms: each arm from the elbow on, against the rest of the body."""
     solid = [i for i in range(model.ngeom) if model.geom_contype[i] and model.geom_conaffinity[i]]
     pairs, forearms = [], []
     for arm in morphology.arms:
         whole = _find_subtree(model, arm.joints[0])
-        # From the upper arm's own turn on: an elbow touches the body before the hand does.
+        # From the upper arm's rotation on, which moves the elbow: that touches the body first.
         forearm = _find_subtree(model, arm.joints[len(arm.joints) // 2 - 1])
         own = [i for i in solid if model.geom_bodyid[i] in forearm]
         rest = [

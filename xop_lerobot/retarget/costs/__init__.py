@@ -1,4 +1,4 @@
-"""Cost terms of the controller, one file each (Eq. 3)."""
+"""Cost terms of the controller (Eq. 3): tracking, effort, balance, collision."""
 
 from xop_lerobot.retarget.costs.balance import (
     FallCost,

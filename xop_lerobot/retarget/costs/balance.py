@@ -1,4 +1,4 @@
-"""Costs of balance: support, stance, fall, and the heading of a base that cannot go sideways.
+"""Cost terms of balance: support, stance, fall, and the heading of a nonholonomic base.
 
 `StanceCost` is the paper's contact point term; the others are ours.
 """
@@ -16,18 +16,18 @@ from xop_lerobot.morphology.contacts import ContactKind
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.static_load import StaticLoad
 
-GRAVITY = 9.81
-_VELOCITY_STEPS = 3  # control steps at the end of the horizon that give the velocity
+GRAVITY = 9.81  # [m/s²]
+_VELOCITY_STEPS = 3  # control steps at the end of the horizon over which the velocity is averaged
 
 
 class SupportArea:
-    """The area on which a robot stands, shrunk by a margin.
+    """Convex support area of a robot, shrunk by a margin.
 
     Args:
         corners: Corners (x, y) in the base's frame, counterclockwise [m]. Shape (c, 2).
-        resting: Where the centre of mass is at rest, in the base's frame [m]. Shape (2,).
-        margin: Distance that is kept from every edge [m].
-        free: Distance from rest up to which a lean costs nothing: arms reach, chests bend [m].
+        resting: Rest position of the centre of mass in the base's frame [m]. Shape (2,).
+        margin: Distance that the area is shrunk by at every edge [m].
+        free: Distance from rest up to which a lean is free, for reaching and bending [m].
     """
 
     def __init__(
@@ -46,19 +46,19 @@ class SupportArea:
         self._free = free
 
     def compute_excess(self, base: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Distances of points beyond each edge, 0 inside [m]. (..., 7), (..., 2) -> (..., c)."""
+        """Distance of points beyond each edge, 0 inside [m]. (..., 7), (..., 2) -> (..., c)."""
         return self.compute_excess_in_base(_to_base(base, points))
 
     def compute_excess_in_base(self, places: np.ndarray) -> np.ndarray:
-        """`compute_excess` of places in the base's frame [m]. (..., 2) -> (..., c)."""
+        """`compute_excess` of points in the base's frame [m]. (..., 2) -> (..., c)."""
         return np.maximum(places @ self._normals.T - self._offsets, 0)
 
     def compute_lean(
         self, base: np.ndarray, com: np.ndarray, balance: np.ndarray | None = None
     ) -> np.ndarray:
-        """Place of the centre of mass beyond the free circle about where it rests [m].
+        """Offset of the centre of mass from its rest position, beyond the free distance [m].
 
-        That is `balance`, shape (2,), or where it rests as the robot stands.
+        The rest position is `balance`, shape (2,), or that of the standing robot.
 
         Shapes (..., 7), (..., 2) -> (..., 2).
         """
@@ -70,7 +70,7 @@ class SupportArea:
     def linearise_excess(
         self, base: np.ndarray, point: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`compute_excess` of one point, and its derivative by the place in the base's frame.
+        """`compute_excess` of one point, and its derivative by the point in the base's frame.
 
         Shapes (7,), (2,) -> (c,), (c, 2).
         """
@@ -81,7 +81,7 @@ class SupportArea:
     def linearise_lean(
         self, base: np.ndarray, com: np.ndarray, balance: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`compute_lean` of one place, and its derivative by the place in the base's frame.
+        """`compute_lean` of one point, and its derivative by the point in the base's frame.
 
         Shapes (7,), (2,) -> (2,), (2, 2).
         """
@@ -91,12 +91,12 @@ class SupportArea:
             return np.zeros(2), np.zeros((2, 2))
         along = offset / length
         share = 1 - self._free / length
-        # Radially the length beyond the circle changes, across only the direction does.
+        # Radially the whole change counts (gain 1); tangentially it is scaled by `share`.
         return offset * share, share * np.eye(2) + (1 - share) * np.outer(along, along)
 
 
 def _to_base(base: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points in the base's place and heading. (..., 7), (..., 2) -> (..., 2)."""
+    """Points relative to the base's position and heading. (..., 7), (..., 2) -> (..., 2)."""
     yaw = quat_yaw(base[..., 3:])
     dx, dy = points[..., 0] - base[..., 0], points[..., 1] - base[..., 1]
     cosine, sine = np.cos(yaw), np.sin(yaw)
@@ -112,19 +112,19 @@ class SupportCost(Cost):
         \xi = c_{xy} + \sqrt{c_z / g}\;\dot c_{xy}
 
     with c the centre of mass and its acceleration the mean over the horizon, from finite
-    differences. On flat ground the robot tips where the zero-moment point z leaves the area
-    (Vukobratović and Borovac, 2004). The horizon is too short to see a tipping that has begun:
-    ξ, at its end and with the velocity relative to the base, is where the centre of mass would
-    come to rest over a pivot if all joints stopped (the capture point; Pratt et al., 2006).
-    The third is the centre of mass itself at the end of the extrapolation, where the robot shall
-    be able to stand still. There its squared distance beyond a free circle about where it rests
-    counts too, with the weight `lean`: a mobile robot shall drive after its goal, not bend; and
-    the static torques there beyond their share of what motors can, squared, with the weight
-    `load`: a torso whose servos give way folds. The paper has no such term.
+    differences. On flat ground the robot tips when the zero-moment point z leaves the area
+    (Vukobratović and Borovac, 2004). The horizon is too short to show that a robot has begun to
+    tip, so the capture point ξ at its end, with the velocity relative to the base, counts too: the
+    point over which the centre of mass would come to rest (Pratt et al., 2006). The third point is
+    the centre of mass at the end of the extrapolation, where the robot must be able to stand
+    still. Two terms are added there: the squared distance of the centre of mass from its rest
+    position beyond a free circle, with the weight `lean`, so that a mobile robot drives to its
+    goal instead of bending; and the squared static torques beyond their allowed share of the motor
+    limits, with the weight `load`, since a torso whose servos give way folds. Not in the paper.
 
     Args:
-        area: The support area, None for a robot whose policy keeps the balance.
-        load: What joints bear of the weight above them; None where that does not count.
+        area: The support area; None for a robot whose policy keeps the balance.
+        load: Static loads of the joints; None if they are not limited.
     """
 
     name = "support"
@@ -142,7 +142,7 @@ class SupportCost(Cost):
             return loaded
         com, dt = evaluation.com[:, 1:], evaluation.dt
         velocity = np.diff(com[..., :2], axis=1) / dt
-        acceleration = np.zeros((len(com), 2))  # two steps or less do not tell
+        acceleration = np.zeros((len(com), 2))  # unknown from fewer than two velocities
         if velocity.shape[1] > 1:
             span = (velocity.shape[1] - 1) * dt
             acceleration = (velocity[:, -1] - velocity[:, 0]) / span
@@ -155,7 +155,7 @@ class SupportCost(Cost):
         return evaluation.weights.support * excess + evaluation.weights.lean * lean + loaded
 
     def _compute_capture_excess(self, evaluation: Evaluation) -> np.ndarray:
-        """Distances of the capture point beyond each edge at the end of the horizon. (K, c)."""
+        """Distance of the capture point beyond each edge at the end of the horizon. (K, c)."""
         assert self.area is not None
         steps = min(_VELOCITY_STEPS, evaluation.com.shape[1] - 1)
         com, base = evaluation.com[:, -1 - steps :], evaluation.qpos[:, -1 - steps :, :7]
@@ -168,14 +168,13 @@ class SupportCost(Cost):
 class StanceCost(Cost):
     r"""Mean over steps of :math:`w_s \sum_{i \in C_k} \|\dot p^c_{i,k}\|^2`.
 
-    Points come in groups that touch the ground together (the four of a foot); each group counts
-    by the mean of its points. C holds every group in stationary mode, and in mobile mode the
-    lowest group of each step, the standing foot. Contacts that do not hold their place in a mode,
-    wheels that must roll, cost nothing in it.
+    Points are grouped by foot or wheel; a group counts by the mean of its points. C holds every
+    group in stationary mode and, in mobile mode, the lowest group of each step: the stance foot.
+    Contacts that must move in a mode, such as rolling wheels, cost nothing in it.
 
     Args:
         groups: Sites of each group of contact points.
-        kind: What they are of.
+        kind: Kind of the contacts, `Feet` or `Wheels`.
     """
 
     name = "stance"
@@ -210,18 +209,18 @@ class StanceCost(Cost):
 class FallCost(Cost):
     r"""Mean over steps of :math:`w_{fall}(\max(0, \alpha - \alpha_s)^2 + \max(0, z_s - z)^2)`.
 
-    α is the tilt of the base and z its height. The safe tilt is halfway between the one at which
-    the robot rests under the executed command and a fall; the safe height is the one at which
-    three quarters of the margin to a fall are used up, or halfway between a fall and the lowest
-    height that can be commanded. So the cost is zero in ordinary motion, also of a robot that
-    squats. The paper has no such term; its predicted falls show up in the tracking cost alone.
+    α is the tilt of the base and z its height. The safe tilt is halfway between that at rest under
+    the executed command and that of a fall. The safe height is a quarter of the way from that of a
+    fall to standing, or halfway from that of a fall to the lowest that can be commanded, whichever
+    is lower. So the cost is zero in ordinary motion, also for a squatting robot. Not in the paper,
+    where predicted falls show up in the tracking cost alone.
 
     Args:
         tilt: Tilt at which the robot counts as fallen [rad].
-        height: Base height under which it counts as fallen [m].
-        standing_height: Base height at rest [m].
+        height: Base height below which it counts as fallen [m].
+        standing_height: Base height when standing [m].
         lowest: Lowest base height that can be commanded [m].
-        compute_rest_tilt: Tilt at which a base rests under a command in a mode [rad]; 0 by default.
+        compute_rest_tilt: Tilt of the base at rest under a command in a mode [rad]; 0 by default.
     """
 
     name = "fall"
@@ -239,7 +238,7 @@ class FallCost(Cost):
         self.safe_height = min(height + (standing_height - height) / 4, (height + lowest) / 2)
 
     def find_falls(self, evaluation: Evaluation) -> np.ndarray:
-        """Which samples count as fallen at some predicted step. Shape (K,), bool."""
+        """Mask of the samples that fall at any predicted step. Shape (K,), bool."""
         base = evaluation.qpos[:, 1:, :7]
         fallen = (_compute_upright(base) < math.cos(self.tilt)) | (base[..., 2] < self.height)
         return np.any(fallen, axis=1)
@@ -256,39 +255,39 @@ class FallCost(Cost):
 
 
 def _compute_upright(base: np.ndarray) -> np.ndarray:
-    """Cosine of the angle of the base's Z to the vertical. Shape (..., 7) -> (...)."""
+    """Cosine of the angle between the base's Z and the vertical. Shape (..., 7) -> (...)."""
     return 1 - 2 * (base[..., 4] ** 2 + base[..., 5] ** 2)
 
 
-_LOOKING = 0.1  # speed at which the way to go and where the goal looks count alike [m/s]
-_REST, _FULL = 0.08, 0.2  # speeds of the head from which on the base is to face so [m/s]
-_TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
-_BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
-_MAX_TWIST = 1.9  # twist of the waist beyond which the base does not face so [rad]
-_TOO_TWISTED = 10.0  # how much a twist beyond it counts
+_LOOKING = 0.1  # u_0: speed at which direction of travel and goal heading weigh the same [m/s]
+_REST, _FULL = 0.08, 0.2  # speeds between which the weight of the heading grows from 0 to 1 [m/s]
+_TWIST = 0.3  # cost of a waist twist relative to a turn of the base [1]
+_BACKWARDS = 0.2  # turn up to which turning is preferred to driving backwards [rad]
+_MAX_TWIST = 1.9  # largest desired twist of the waist [rad]
+_TOO_TWISTED = 10.0  # cost of a twist beyond it, relative to a turn [1]
 
 
 def compute_facing(heading: float, velocity: np.ndarray, look: float, speed: float) -> np.ndarray:
-    r"""Compute where a base on wheels shall face, and how much that counts.
+    r"""Compute the desired heading of a wheeled base, and its weight.
 
     .. math:: \psi^\pm = \angle(\pm u + u_0\,(\cos\psi_g, \sin\psi_g))
 
-    for driving forwards (+) and backwards (-), with u the velocity that takes the axle to where
-    it will be when the robot stands straight at its goal, and :math:`\psi_g` where the goal
-    looks; of the two that with less of a turn and less of a twist is taken, and none that twists
-    the waist further than it can: who walks ahead is never followed backwards. Far from its goal
-    the base lines up with the way there, near it with the goal, so that driving on closes in on
-    the line through the goal, as in parking (path following of a unicycle; Siciliano et al.,
-    Robotics, 2009, section 11.6). The last centimetres are left to the waist.
+    for driving forwards (+) or backwards (-), with u the velocity that takes the axle to its
+    position when the robot stands straight at its goal, and :math:`\psi_g` the heading of the
+    goal. Of the two, the one with the smaller turn and twist is taken; a twist beyond the range of
+    the waist is all but excluded, so an operator who walks ahead is never followed backwards. Far
+    from its goal the base lines up with its direction of travel, near it with the goal, so that
+    driving on converges to the line through the goal, as in parking (path following of a unicycle;
+    Siciliano et al., Robotics, 2009, section 11.6). The last centimetres are left to the waist.
 
     Args:
         heading: Heading of the base [rad].
         velocity: The axle's velocity u [m/s]. Shape (2,).
         look: Heading of the goal [rad].
-        speed: Speed at which what is tracked would be at its goal in time [m/s].
+        speed: Speed with which the tracked frame would reach its goal in time [m/s].
 
     Returns:
-        Direction in the world, as long as it counts: 0 to 1. Shape (2,).
+        Direction in the world, whose length is the weight, 0 to 1. Shape (2,).
     """
     ahead = _LOOKING * np.array([math.cos(look), math.sin(look)])
     best, least = look, math.inf
@@ -305,7 +304,7 @@ def compute_facing(heading: float, velocity: np.ndarray, look: float, speed: flo
 
 
 def compute_lateral(base: np.ndarray, facing: np.ndarray) -> np.ndarray:
-    """Angle of bases to where they shall face, times how much it counts [rad].
+    """Heading error of bases from `facing`, times its weight [rad].
 
     Shapes (..., 7), (2,) -> (...).
     """
@@ -314,17 +313,17 @@ def compute_lateral(base: np.ndarray, facing: np.ndarray) -> np.ndarray:
 
 
 class LateralCost(Cost):
-    r""":math:`w_n\,s^2(\psi^* - \psi)^2`, the heading of a base that cannot go sideways.
+    r""":math:`w_n\,s^2(\psi^* - \psi)^2`, the heading error of a nonholonomic base.
 
-    :math:`\psi^*` is where it shall face and s how much that counts (`compute_facing`), ψ its
-    heading at the end of the extrapolation. A head that sits behind the axle can be moved
-    sideways by turning the base, which is right for a few centimetres at rest. Done while
-    driving it turns the base away from where it drives, ever further (the zero dynamics of an
-    offset point are unstable ahead; Siciliano et al., Robotics, 2009, section 11.5), until the
-    waist is at its limit. Only mobile robots on wheels have the term.
+    :math:`\psi^*` is the desired heading and s its weight (`compute_facing`), ψ the heading at the
+    end of the extrapolation. A head behind the axle can be moved sideways by turning the base,
+    which is right for a few centimetres at rest. While driving, it turns the base further and
+    further away from its direction of travel (the zero dynamics of an offset point are unstable
+    ahead; Siciliano et al., Robotics, 2009, section 11.5), until the waist is at its limit. Not in
+    the paper; zero for robots that can move sideways.
 
     Args:
-        nonholonomic: Whether the robot drives but cannot go sideways.
+        nonholonomic: Whether the robot drives but cannot move sideways.
     """
 
     name = "lateral"

@@ -1,4 +1,4 @@
-"""Collision avoidance cost."""
+"""Cost term of collision avoidance, and detection of predicted contacts with obstacles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.obstacles import Obstacle, ObstacleSet, make_obstacles
 
-_DEEPER = 0.001  # what counts as going further in, where the hull already is inside [m]
+_DEEPER = 0.001  # deeper penetration than at the start that counts as a touch [m]
 
 __all__ = ["CollisionCost", "Obstacle", "make_obstacles"]
 
@@ -21,17 +21,16 @@ class CollisionCost(Cost):
     The same barrier counts once more at the end of the extrapolation: the horizon alone is too
     short to brake before a wall.
 
-    :math:`d_j` is the least distance of the robot's hull to obstacle j, v the velocity of the
-    base. At `collision_range` both terms are cut off smoothly, by the value that they have
-    there, so that far walls do not push; with an infinite range it is the paper's formula.
+    :math:`d_j` is the smallest distance of the robot's hull to obstacle j, v the velocity of the
+    base. Both terms are reduced by their value at `collision_range` and are zero beyond, so that
+    distant walls do not push; with an infinite range it is the paper's formula.
 
     Args:
-        obstacles: What to keep clear of.
+        obstacles: Obstacles to avoid.
         points: Sites on the hull of the robot and the radius around each [m].
-        hands: Those of `points` that are about hands: what is `handled` is none of their
-            obstacles.
-        base: Those of `points` that are about the base: while nothing drives it they cost
-            nothing, or how it trembles beside something would count for more than any goal.
+        hands: Hull sites of the hands, which need not avoid `handled` obstacles.
+        base: Hull sites of the base. While nothing drives the base they cost nothing: it cannot
+            avoid anything, and its tremor beside an obstacle would outweigh any goal.
     """
 
     name = "collision"
@@ -50,7 +49,7 @@ class CollisionCost(Cost):
         self.set_obstacles(obstacles)
 
     def set_obstacles(self, obstacles: Iterable[Obstacle]) -> None:
-        """Take another set of obstacles, from the next solve on."""
+        """Replace the obstacles, from the next solve on."""
         self.obstacles = ObstacleSet(obstacles)
 
     def compute(self, evaluation: Evaluation) -> np.ndarray:
@@ -58,7 +57,7 @@ class CollisionCost(Cost):
         num = len(evaluation.qpos)
         if not len(self.obstacles) or not self.points:
             return np.zeros(num)
-        # The first step is the start, which no command changes; the extrapolation comes last.
+        # Without step 0, the start, which no command changes; the extrapolation comes last.
         hull = np.concatenate(
             [
                 self._stack(evaluation.points)[:, 1:],
@@ -82,7 +81,7 @@ class CollisionCost(Cost):
         return barrier[:, :-1].mean(axis=1) + barrier[:, -1]
 
     def find_touches(self, evaluation: Evaluation) -> np.ndarray:
-        """Which samples touch an obstacle, more deeply than the start does. Shape (K,), bool."""
+        """Mask of the samples that touch an obstacle more deeply than the start. (K,), bool."""
         num = len(evaluation.qpos)
         if not len(self.obstacles) or not self.points:
             return np.zeros(num, dtype=bool)
@@ -96,12 +95,12 @@ class CollisionCost(Cost):
     def compute_clearance(
         self, points: Mapping[str, np.ndarray], which: np.ndarray | None = None
     ) -> np.ndarray:
-        """Least distance of the hull to any obstacle on the way [m]; infinite without any.
+        """Smallest distance of the hull to any obstacle along each sample [m]; inf without any.
 
         Args:
-            points: Positions of the hull's sites over the steps, others are not used, as in
-                `Evaluation.points`. Shapes (K, ..., 3).
-            which: Obstacles of interest; all by default. Shape (n,), int.
+            points: Positions of sites, as in `Evaluation.points`; only the hull's are used.
+                Shapes (K, ..., 3).
+            which: Indices of the obstacles; all by default. Shape (n,), int.
 
         Returns:
             Distance of every sample, negative inside. Shape (K,).
@@ -112,13 +111,13 @@ class CollisionCost(Cost):
         return self._compute_distances(self._stack(points), which).reshape(num, -1).min(axis=1)
 
     def _stack(self, points: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Positions of the hull's sites. Shape (..., P, 3)."""
+        """Stack the positions of the hull's sites. Shape (..., P, 3)."""
         return np.stack([points[site] for site in self.points], axis=-2)
 
     def _compute_distances(
         self, hull: np.ndarray, which: np.ndarray | None, left_out: np.ndarray | None = None
     ) -> np.ndarray:
-        """Distance of the hull, but for what is left out, to each obstacle [m].
+        """Distance of the hull, without the sites `left_out`, to each obstacle [m].
 
         Shapes (..., P, 3) and (P,) -> (..., n).
         """

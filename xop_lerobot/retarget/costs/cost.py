@@ -1,4 +1,4 @@
-"""The interface of a cost term and what it is given."""
+"""Interface of cost terms, and the predicted quantities that they are computed from."""
 
 from __future__ import annotations
 
@@ -14,34 +14,35 @@ from xop_lerobot.morphology.tuning import CostWeights
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A batch of predictions to be scored.
+    """A batch of predictions to score.
 
     Attributes:
         qpos: Predicted positions; step 0 is the start. Shape (K, H + 1, nq).
         qvel: Predicted velocities. Shape (K, H + 1, nv).
-        commands: Commands that are tried, before the rate limits. Shape (K, H, k).
+        commands: Sampled commands, before the rate limits. Shape (K, H, k).
         executed: The command being executed. Shape (k,).
-        reference: The command that costs nothing. Shape (k,).
-        poses: Predicted pose of each tracked frame. Shapes (K, H + 1, 7). As all that is read
-            off the simulator, step 0 is the start, and the others are one physics step before
-            the end of each control step.
+        reference: The command of zero control cost. Shape (k,).
+        poses: Predicted pose of each tracked frame. Shapes (K, H + 1, 7). As in all sensor
+            readings, step 0 is the start, and step k is one physics step before the end of
+            control step k.
         points: Predicted position of contact and hull sites. Shapes (K, H + 1, 3).
         velocities: Predicted velocity of contact sites [m/s]. Shapes (K, H + 1, 3).
-        terminal_points: Position of those sites at the end of the extrapolation. Shape (K, 3).
+        terminal_points: Position of those sites at the end of the extrapolation. Shapes (K, 3).
         com: Predicted centre of mass, of robots with a support area. Shape (K, H + 1, 3).
         terminal_qpos: Position at the end of the extrapolation. Shape (K, nq).
-        terminal_com: Centre of mass then, of robots with a support area. Shape (K, 3).
+        terminal_com: Centre of mass at that time, of robots with a support area. Shape (K, 3).
         goals: Goal of each tracked frame at every step. Shapes (H + 1, 7).
         terminal_poses: Pose of each tracked frame at the end of the extrapolation. (K, 7).
-        terminal_goals: Goal of each tracked frame then. Shapes (7,).
-        facing: Where a base on wheels shall face, as long as that counts, 0 to 1. Shape (2,).
+        terminal_goals: Goal of each tracked frame at that time. Shapes (7,).
+        facing: Desired heading of a wheeled base as a direction in the world, whose length is its
+            weight, 0 to 1. Shape (2,).
         mode: Mode of the robot.
         dt: Time between steps [s].
         weights: The weights.
-        upright: Tracked frames whose hand is to stay level.
-        balance: Where the centre of mass shall rest on the base, of robots with a support area;
-            None: where it does as the robot stands. Shape (2,).
-        drives: Whether anything that is decided moves the base over the ground.
+        upright: Tracked frames of hands that are kept level.
+        balance: Desired rest position of the centre of mass on the base, of robots with a support
+            area; None for that of the standing robot. Shape (2,).
+        drives: Whether any free entry moves the base over the ground.
     """
 
     qpos: np.ndarray
@@ -71,12 +72,15 @@ class Evaluation:
 class Cost(ABC):
     """One term of the cost.
 
-    Sums over a horizon are means over its steps, so that a weight means the same for every
-    horizon.
+    Sums over the horizon are implemented as means over its steps, so that weights do not depend
+    on the horizon. A term must not mix samples.
+
+    Attributes:
+        name: Name of the term in `Plan.cost` and in datasets.
     """
 
     name: str
 
     @abstractmethod
     def compute(self, evaluation: Evaluation) -> np.ndarray:
-        """Cost of every sample, its weight included. Shape (K,)."""
+        """Weighted cost of every sample. Shape (K,)."""

@@ -1,4 +1,4 @@
-"""Costs of effort: control (paper) and change of the command (ours)."""
+"""Cost terms of effort: control (paper) and change of the command (ours)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 class ControlCost(Cost):
     r"""Mean over steps of :math:`w_a\|(a_k - a_{ref})/s\|^2`, s half the range of each entry.
 
-    With the absolute command of the paper the term pulls a standing height towards zero; with
-    the kinematic proposal as reference it costs only what is done beyond it.
+    With the paper's absolute command (a reference of zero) the term would pull a standing height
+    towards zero; with the kinematic proposal as reference only deviations from it cost.
 
     Args:
         scale: Half the range of each command entry. Shape (k,).
@@ -32,8 +32,8 @@ class ControlCost(Cost):
 class ChangeCost(Cost):
     r"""Mean over steps of :math:`w_\Delta\|(a_k - a_{exec})/s\|^2`, s half the range of each entry.
 
-    :math:`a_{exec}` is the command that is being executed. What the paper's control energy is
-    for, smooth and slow motion, without its pull on a steady command.
+    :math:`a_{exec}` is the command being executed. It serves the purpose of the paper's control
+    energy, smooth and slow motion, without pulling a steady command towards zero.
 
     Args:
         scale: Half the range of each command entry. Shape (k,).

@@ -1,4 +1,4 @@
-"""The list of cost terms, and how those of a robot are made."""
+"""List of all cost terms, and the factory of those of a robot."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ COSTS: tuple[type[Cost], ...] = (
     LateralCost,
     FallCost,
 )
-"""All terms; datasets list them in this order, so a new one comes last."""
+"""All terms; datasets store them in this order, so append new ones."""
 
 
 def make_costs(
@@ -45,7 +45,7 @@ def make_costs(
     fall: FallCost,
     load: StaticLoad | None = None,
 ) -> tuple[Cost, ...]:
-    """Make all of `COSTS`; those that a robot has no use for cost nothing."""
+    """Make all of `COSTS`; terms that do not apply to a robot are zero."""
     space = command_model.space
     costs = (
         TrackingCost(),

@@ -1,4 +1,4 @@
-"""Costs of tracking: goals over the horizon and at its end, and level palms; all of the paper."""
+"""Cost terms of tracking: goals over the horizon and at its end, level hands (all in the paper)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TrackingCost(Cost):
     r"""Mean over steps of :math:`\sum_f w_p\|p - p^d\|^2 + w_\theta\,d(\theta, \theta^d)^2`.
 
     p, θ are the predicted position and orientation of a tracked frame, d the angle between two
-    orientations. The paper writes it for the base pose; a frame anywhere on the body includes it.
+    orientations. The paper has the base pose here; a tracked frame may be anywhere on the body.
     """
 
     name = "tracking"
@@ -39,8 +39,8 @@ def compute_tracking(poses: np.ndarray, goals: np.ndarray, weights: CostWeights)
 
     .. math:: w_p\|p - p^d\|^2 + w_\theta(e_\psi^2 + \kappa(e_x^2 + e_y^2))
 
-    with the errors of heading and tilt of `heading_error`, and κ the share of a tilt: at κ = 1
-    and for small errors, the paper's :math:`d(\theta, \theta^d)^2`.
+    with the heading and tilt errors of `heading_error`, and κ the relative weight of a tilt
+    (`tilt_share`). For κ = 1 and small errors it is the paper's :math:`d(\theta, \theta^d)^2`.
     """
     position = sum_squares(poses[..., :3] - goals[..., :3])
     turn, tilt = compute_heading_squares(goals[..., 3:], poses[..., 3:])
@@ -50,9 +50,9 @@ def compute_tracking(poses: np.ndarray, goals: np.ndarray, weights: CostWeights)
 class TerminalCost(Cost):
     r""":math:`V_f = w_f\,l_{track}(\phi_\tau(x_H, a_{H-1}), G(t + H\,dt + \tau))`.
 
-    φ extrapolates the last predicted state by the `CommandModel`, as if its last command were
-    held for τ; with τ = 0 it is the paper's terminal cost. A horizon of 0.1 s alone cannot see
-    what a walking command is good for.
+    φ extrapolates the last predicted state by the `CommandModel`, with the last command held for
+    τ; with τ = 0 it is the paper's terminal cost. A horizon of some tenths of a second alone does
+    not show the benefit of a walking command.
     """
 
     name = "terminal"
@@ -73,10 +73,10 @@ class UprightCost(Cost):
 
     .. math:: h = R(\theta)\,R_{ee}(q)\,e_z - s\,e_z
 
-    of each hand that is to stay level: the paper's constraint of Version 2, as a penalty. The Z
-    of a wrist points out of the back of the hand; s is 1 where the operator's palm faces down,
-    and -1 where it faces up, as under a tray. For a small tilt α is
-    :math:`\|h\|^2 = 2(1 - \cos\alpha) \approx \alpha^2`. It leaves the heading of the hand free.
+    of each hand that is kept level: the paper's constraint of Version 2, as a penalty. The Z of a
+    wrist points out of the back of the hand; s is 1 if the operator's palm faces down and -1 if it
+    faces up, as under a tray. For a small tilt α, :math:`\|h\|^2 = 2(1 - \cos\alpha) \approx
+    \alpha^2`. The heading of the hand stays free.
     """
 
     name = "upright"
@@ -92,7 +92,7 @@ class UprightCost(Cost):
 
 
 def compute_side(pose: np.ndarray) -> np.ndarray:
-    """Side of a hand that is up: 1 for its back, -1 for its palm. Shape (..., 7) -> (...)."""
+    """Upper side of a hand: 1 for its back, -1 for its palm. Shape (..., 7) -> (...)."""
     return np.where(quat_rotate(pose[..., 3:], _UP)[..., 2] < 0, -1.0, 1.0)
 
 
@@ -107,10 +107,10 @@ def compute_upright_error(poses: np.ndarray, side: np.ndarray | float = 1.0) -> 
 
 
 def make_level(pose: np.ndarray) -> np.ndarray:
-    """Turn a pose by the least angle that makes its Z vertical. Shape (..., 7) -> (..., 7).
+    """Rotate a pose by the smallest angle that makes its Z vertical. Shape (..., 7) -> (..., 7).
 
-    What the operator's hand asks for while it is to stay level: tracking its tilt too would
-    compete with the constraint. The side of the hand that is up stays up.
+    Used for goals of hands that are kept level, whose tilt would compete with the constraint. The
+    upper side of the hand stays up.
     """
     up = compute_side(pose)[..., None] * quat_rotate(pose[..., 3:], _UP)
     x, y, z = np.moveaxis(up, -1, 0)

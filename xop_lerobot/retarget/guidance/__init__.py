@@ -1,1 +1,1 @@
-"""Reference trajectory over the horizon, and where a base on wheels shall face."""
+"""Reference trajectory over the horizon, and desired heading of a wheeled base."""

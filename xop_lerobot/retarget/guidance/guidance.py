@@ -1,7 +1,6 @@
-"""Reference trajectory over the horizon, and the desired heading of a base on wheels.
+"""Reference trajectory over the horizon: goal poses of each step and desired base heading.
 
-`Guidance` makes the goal poses of each step; `FacingRule` says which way a base faces that drives
-after a moving goal.
+`Guidance` is the entry point; `FacingRule` gives the heading of a base that follows a moving goal.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from xop_lerobot.retarget.posture_guide import HEAD, Served
 
 
 class FacingRule:
-    """Finds the facing for the first target; see `compute_facing`.
+    """Desired base heading for the first target; see `compute_facing`.
 
     Args:
         morphology: The robot.
-        resting: How far ahead of the base each tracked frame is at rest [m].
+        resting: Forward distance of each tracked frame from the base at rest [m].
     """
 
     def __init__(self, morphology: Morphology, resting: Mapping[str, float]) -> None:
@@ -45,16 +44,19 @@ class FacingRule:
         dt: float,
         ahead: Mapping[str, float] | None = None,
     ) -> np.ndarray:
-        """Compute where the base shall face. A hand looks nowhere: for it, as it faces now.
+        """Compute the desired base heading.
+
+        Hand targets have no gaze direction, so the present heading is kept for them.
 
         Args:
-            state: Where the robot is.
+            state: The planner's state.
             then: Goal of each tracked frame in `dt`. Shapes (1, 7).
-            dt: Time to get there [s].
-            ahead: How far ahead of the base frames will be, where not as at rest [m].
+            dt: Time to reach the goals [s].
+            ahead: Forward distances of frames from the base at their goals, where they differ
+                from those at rest [m].
 
         Returns:
-            Direction in the world, as long as it counts. Shape (2,).
+            Direction in the world, whose length is its weight. Shape (2,).
         """
         qpos, pivot = state.qpos, self._pivot
         heading = float(quat_yaw(qpos[3:7]))
@@ -76,11 +78,11 @@ def _direction(heading: float) -> np.ndarray:
     return np.array([np.cos(heading), np.sin(heading)])
 
 
-_UPRIGHT = 0.9  # cosine of a waist's axis to the vertical, from which on it stands upright
+_UPRIGHT = 0.9  # cosine to the vertical from which a joint axis counts as vertical
 
 
 def find_waist_axis(morphology: Morphology, model: mujoco.MjModel) -> float:
-    """How far ahead of the base the uppermost vertical joint is, as the robot stands [m]."""
+    """Forward distance of the uppermost vertical joint from the base of a standing robot [m]."""
     data = mujoco.MjData(model)
     data.qpos[: len(morphology.standing_qpos())] = morphology.standing_qpos()
     mujoco.mj_kinematics(model, data)
@@ -89,24 +91,24 @@ def find_waist_axis(morphology: Morphology, model: mujoco.MjModel) -> float:
     return float(data.xanchor[upright[-1], 0]) if upright else 0.0
 
 
-_LOOK_AHEAD = 1.6  # length of a way that is looked at: about a quarter turn [s]
-_STILL = 0.1  # speed of a goal under which it counts as standing still [m/s]
+_LOOK_AHEAD = 1.6  # least duration of a simulated path: about a quarter turn [s]
+_STILL = 0.1  # speed below which a goal counts as stationary [m/s]
 
 
 class Guidance:
-    """Turns the goal of now into goals over the horizon.
+    """Extends the present goal to a reference trajectory over the horizon.
 
-    A goal that stands still is led along the way that a base on wheels takes to it (`Route`).
-    One that moves is followed within reach, the base facing where it goes (`FacingRule`): a way
-    that ends at the goal would always be late. A robot that can go sideways, or that does not
-    drive, has its goals within reach and nothing more.
+    For a nonholonomic base, a stationary goal is reached along a simulated path (`RoutePlanner`),
+    whose poses are the reference. A moving goal is followed directly, with the base heading of
+    `FacingRule`: a path that ends at the goal would always be late. For all other robots, and if
+    the base is not driven, the goal is only limited in distance and extrapolated.
 
     Args:
         morphology: The robot.
         model: Its planning model.
-        command_model: What is decided; says whether the base drives but cannot go sideways.
-        resting: How far ahead of the base each tracked frame is at rest [m].
-        footprint: Tells how near the base comes to obstacles.
+        command_model: Command model; tells whether the base is nonholonomic.
+        resting: Forward distance of each tracked frame from the base at rest [m].
+        footprint: Clearance of the base from obstacles.
     """
 
     def __init__(
@@ -131,17 +133,17 @@ class Guidance:
         config: MpcConfig,
         served: Served | None = None,
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Compute the goals at `compute_times`, and where a base on wheels shall face at the end.
+        """Compute the goals at `compute_times`, and the desired base heading at their end.
 
         Args:
-            state: Where the robot is, with the decision that it executes.
-            goal: The goal now.
+            state: The planner's state, with the executed decision.
+            goal: Present goal.
             config: Parameters of the mode.
-            served: The posture for the head's goal, None where there is none.
+            served: Posture for the head's goal; None if there is none.
 
         Returns:
-            Poses, shapes (H + 3, 7), and a direction in the world, as long as it counts: zero
-            where none does. Shape (2,).
+            Poses, shapes (H + 3, 7), and the heading as a direction in the world whose length is
+            its weight; zero for none. Shape (2,).
         """
         times, poses = compute_times(config), state.poses
         ahead = {} if served is None else {HEAD: served.ahead}
@@ -157,7 +159,7 @@ class Guidance:
         return goals, self._facing.compute(state, then, config.proposal_s, ahead)
 
     def _drives(self, mode: Mode) -> bool:
-        """Whether wheels are among what may be moved in `mode`."""
+        """Whether the free entries drive a nonholonomic base in `mode`."""
         free = self._command_model.acting(mode).astype(float)
         return (
             self._command_model.is_nonholonomic and self._command_model.compute_twist(free)[0] > 0
@@ -172,7 +174,7 @@ class Guidance:
         config: MpcConfig,
         ahead: Mapping[str, float],
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Goals where the base will have carried the frame `name`; the others go with it."""
+        """Goals along the base's path to the goal of the frame `name`; others shift with it."""
         assert self._routes is not None
         poses = state.poses
         twist = self._command_model.compute_twist(state.executed)
@@ -198,9 +200,9 @@ class Guidance:
 
 
 def compute_times(config: MpcConfig) -> np.ndarray:
-    """Times at which goals are asked for [s]: the control steps, and two further ones.
+    """Times of the reference trajectory [s]: the control steps and two more. Shape (H + 3,).
 
-    Those are the end of the extrapolation, and what the proposal aims at. Shape (H + 3,).
+    The last two are the end of the extrapolation and the target time of the proposal.
     """
     end = config.horizon * POLICY_DT
     steps = np.arange(config.horizon + 1) * POLICY_DT

@@ -1,6 +1,7 @@
-"""Path of a base that cannot go sideways, to a goal at rest: turn, drive, arrive.
+"""Path of a nonholonomic base to a stationary goal: turn, drive, arrive.
 
-`Footprint` is the part of the hull that goes with the base, and its clearance along a path.
+`RoutePlanner.plan` simulates the path with a feedback law and returns it as a `Route`; `Footprint`
+gives the clearance of the base along a path.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from xop_lerobot.retarget.obstacles import Obstacle, ObstacleSet
 
 
 class Footprint:
-    """The hull's spheres that sit on the base itself, and the obstacles about them.
+    """Hull spheres that are attached to the base, and their distance to obstacles.
 
     Args:
         morphology: The robot.
         model: Its planning model.
-        obstacles: What stands around it.
+        obstacles: Obstacles around the robot.
     """
 
     def __init__(
@@ -44,15 +45,15 @@ class Footprint:
         self.set_obstacles(obstacles)
 
     def set_obstacles(self, obstacles: Iterable[Obstacle]) -> None:
-        """Take other obstacles."""
+        """Replace the obstacles."""
         self._obstacles = ObstacleSet(obstacles)
 
     def compute_clearance(self, axle: np.ndarray, headings: np.ndarray) -> np.ndarray:
         """Distance of the base to the nearest obstacle, negative inside; infinite without any [m].
 
         Args:
-            axle: Places of the middle of the axle [m]. Shape (n, 2).
-            headings: Headings there [rad]. Shape (n,).
+            axle: Positions of the middle of the axle [m]. Shape (n, 2).
+            headings: Headings of the base [rad]. Shape (n,).
 
         Returns:
             Shape (n,).
@@ -68,36 +69,36 @@ class Footprint:
         return distances.min(axis=(1, 2))
 
 
-_DT = 0.04  # step of the simulated way [s]
-_FINE = 6.0  # gain of the last centimetres and degrees, where the braking law is too steep [1/s]
-_FINE_DRIVE, _FINE_TURN = 0.05, 0.1  # within which that gain holds [m], [rad]
-_BACKWARDS = 0.2  # turn that is preferred to driving backwards [rad]
-_TWIST = 0.3  # how much a twist of the waist counts beside a turn of the base
-_RESTING, _TURNING = 0.15, 0.45  # yaw rates of a goal that rests and of one that turns [rad/s]
-_TWIST_RAMP = 0.3  # beyond which twist the base turns in earnest [rad]
-_CLOSE = 0.12  # distance of the axle from its place at which it faces nothing anew [m]
-_MUST_TURN = 0.05  # turn back into what the waist allows from which on it comes first [rad]
-_CLOSE_TURNING = 0.35  # that distance meanwhile: a turn carries the head off [m]
-_LINE_UP = 0.2  # distance of the place at which its heading counts like the way to it [m]
-_ITERATIONS = 4  # place and heading of the arrival depend on each other
-_DETOURS = (0.4, -0.4, 0.8, -0.8)  # drives straight on or back before a turn that is barred [m]
-_DETOUR_FROM = 0.3  # distance from the goal under which none is made: it would dance there [m]
-_DEEPER = 0.005  # by which an obstacle must come nearer than touching to bar the way [m]
-_TURNED = 0.15  # turn that is still to come where the way is barred [rad]
+_DT = 0.04  # time step of the simulated path [s]
+_FINE = 6.0  # proportional gain near the goal, where the braking law is too steep [1/s]
+_FINE_DRIVE, _FINE_TURN = 0.05, 0.1  # distances within which that gain applies [m], [rad]
+_BACKWARDS = 0.2  # turn up to which turning is preferred to driving backwards [rad]
+_TWIST = 0.3  # cost of a waist twist relative to a turn of the base [1]
+_RESTING, _TURNING = 0.15, 0.45  # yaw rates of a goal at rest and of a turning one [rad/s]
+_TWIST_RAMP = 0.3  # excess twist over which the weight of the heading grows to 1 [rad]
+_CLOSE = 0.12  # distance from its goal position at which the axle no longer turns towards it [m]
+_MUST_TURN = 0.05  # turn into the waist's range from which that turn has priority [rad]
+_CLOSE_TURNING = 0.35  # `_CLOSE` during such a turn, which displaces the head [m]
+_LINE_UP = 0.2  # distance at which arrival heading and direction of the path weigh the same [m]
+_ITERATIONS = 4  # fixed-point iterations: position and heading at arrival depend on each other
+_DETOURS = (0.4, -0.4, 0.8, -0.8)  # straight drives before a blocked turn, shortest first [m]
+_DETOUR_FROM = 0.3  # distance to the goal below which no detour is made, to avoid dithering [m]
+_DEEPER = 0.005  # penetration of an obstacle from which it blocks the path [m]
+_TURNED = 0.15  # remaining turn where the path is blocked from which a detour can help [rad]
 
 
 @dataclass(frozen=True)
 class Route:
-    """Where a base will have carried what is tracked, beside its goal.
+    """Path of a base, as offsets of the tracked frame from its goal.
 
     Attributes:
         times: Times from now [s]. Shape (n,).
-        offsets: Where it is carried, less the goal, by more than the torso bridges [m].
-            Shape (n, 2).
+        offsets: Horizontal offset of the tracked frame from its goal, beyond what the torso can
+            bridge [m]. Shape (n, 2).
         headings: Heading of the base, not wrapped [rad]. Shape (n,).
-        turns: How far the frame is to be turned from its goal about the vertical, since the waist
-            has to go round by its front; 0 once it can be at its goal [rad]. Shape (n,).
-        share: How much that heading counts, from 0 at the goal to 1 away from it.
+        turns: Heading of the tracked frame relative to its goal while the waist turns round by
+            its front; 0 once the goal is within its range [rad]. Shape (n,).
+        share: Weight of `headings`, from 0 at the goal to 1 away from it.
     """
 
     times: np.ndarray
@@ -107,31 +108,31 @@ class Route:
     share: float
 
     def turns_at(self, ahead: np.ndarray) -> np.ndarray:
-        """Turns from the goal at times from now [s]. (n,) -> (n,)."""
+        """Interpolate `turns` at times from now [s]. (n,) -> (n,)."""
         return np.interp(ahead, self.times, self.turns)
 
     def offsets_at(self, ahead: np.ndarray) -> np.ndarray:
-        """Offsets from the goal at times from now [s], the outermost beyond. (n,) -> (n, 2)."""
+        """Interpolate `offsets` at times from now [s], clamped at the ends. (n,) -> (n, 2)."""
         columns = [np.interp(ahead, self.times, column) for column in self.offsets.T]
         return np.stack(columns, axis=-1)
 
     def facing_at(self, ahead: float) -> np.ndarray:
-        """Direction of the base in `ahead` [s], as long as it counts. Shape (2,)."""
+        """Heading in `ahead` [s] as a direction whose length is its weight. Shape (2,)."""
         heading = float(np.interp(ahead, self.times, self.headings))
         return self.share * np.array([math.cos(heading), math.sin(heading)])
 
 
 class _Aim(NamedTuple):
-    """What is to be carried where, and how it sits on the axle.
+    """Goal of the tracked frame, and the geometry between the frame and the axle.
 
     Attributes:
-        x: Place of the goal [m].
-        y: The same.
-        look: Where it looks [rad].
-        twist: Largest twist of the waist in which the base may arrive [rad].
-        waist: Place of what the waist turns about, in the base's frame, from the axle [m].
-        ahead: How far ahead of that the tracked frame is, wherever it looks [m].
-        driving: How the base drives.
+        x: Goal position x [m].
+        y: Goal position y [m].
+        look: Heading of the goal [rad].
+        twist: Largest waist twist at arrival [rad].
+        waist: Position of the waist's axis relative to the axle, in the base's frame [m].
+        ahead: Distance of the tracked frame from the waist's axis, along its heading [m].
+        driving: Limits and gains of the base.
     """
 
     x: float
@@ -143,38 +144,37 @@ class _Aim(NamedTuple):
     driving: Driving
 
     def clip(self, heading: float) -> float:
-        """The heading nearest to `heading` in which the base may arrive [rad]."""
+        """The allowed arrival heading closest to `heading` [rad]."""
         return self.look + min(max(_wrap(heading - self.look), -self.twist), self.twist)
 
-    def find_way(self, x: float, y: float, heading: float) -> tuple[float, float]:
-        """From the axle at x, y to its place under the goal, arriving in `heading` [m]."""
+    def find_path(self, x: float, y: float, heading: float) -> tuple[float, float]:
+        """Vector from the axle at x, y to its position on arrival with `heading` [m]."""
         waist, head = _rotate(*self.waist, heading), _rotate(self.ahead, 0.0, self.look)
         return self.x - waist[0] - head[0] - x, self.y - waist[1] - head[1] - y
 
 
 class RoutePlanner:
-    r"""Simulates how a base with two wheels drives to its goal as fast as its limits allow.
+    r"""Simulates how a differential-drive base reaches its goal within its limits.
 
-    The axle's place p* depends on the heading ψ* in which the base arrives, and on where the goal
-    looks, since a head sits ahead of its waist's axis. A waist that turns leaves ψ* free by
-    `Driving.arrival_twist` on either side of where the goal looks, so that the base mostly need
-    not turn again once it is there. It turns towards :math:`\pm(p^* - p)`, forwards or backwards,
-    whatever costs less of a turn and of a twist, by the braking law
-    :math:`\omega = \sqrt{2\alpha|e|}`, and drives by the same law as far as it faces its way,
-    :math:`v = \cos^4 e\,\sqrt{2 b d}`. Both depend on the present state alone, so that a way
-    that is computed anew goes on as before.
+    The position p* of the axle at arrival depends on the arrival heading ψ* of the base and on
+    the heading of the goal, since a head sits ahead of its waist's axis. The waist leaves ψ* free
+    by `Driving.arrival_twist` on either side of the goal's heading, so that the base mostly need
+    not turn again on arrival. The base turns towards :math:`\pm(p^* - p)`, forwards or backwards,
+    whichever needs less turn and twist, by the braking law :math:`\omega = \sqrt{2\alpha|e|}`. It
+    drives by the same law, as far as it faces its path, :math:`v = \cos^4 e\,\sqrt{2 b d}`. Both
+    depend on the present state alone, so a recomputed path continues the previous one.
 
-    Beside a wall a turn may be barred. The base then drives straight on or back first, the
-    shortest drive after which it can turn.
+    Beside a wall a turn may be blocked. The base then first drives straight on or back, by the
+    shortest distance after which it can turn.
 
-    Far from its goal a robot on wheels does better to turn away from it first. No horizon of a
-    third of a second shows that: the way is what its goals are led along.
+    A wheeled robot may have to turn away from a goal at its side first, which a horizon of a third
+    of a second does not show. So the simulated path is the reference of the planner.
 
     Args:
         morphology: The robot.
-        resting: How far ahead of the base each tracked frame is at rest [m].
-        footprint: Tells how near the base comes to obstacles; None: there are none.
-        waist: How far ahead of the base is what the waist turns about [m].
+        resting: Forward distance of each tracked frame from the base at rest [m].
+        footprint: Clearance of the base from obstacles; None without obstacles.
+        waist: Forward distance of the waist's axis from the base [m].
 
     References:
         Siciliano et al., Robotics, 2009, section 11.5 (limits of feedback to a point for a
@@ -190,7 +190,7 @@ class RoutePlanner:
     ) -> None:
         self._footprint, self._waist = footprint, waist
         self._pivot, self._resting = morphology.pivot, dict(resting)
-        assert morphology.driving is not None, f"how {morphology.name} drives is not known"
+        assert morphology.driving is not None, f"{morphology.name} has no driving parameters"
         self._driving = morphology.driving
         self._hands = {arm.frame for arm in morphology.arms}
 
@@ -205,18 +205,19 @@ class RoutePlanner:
         turn_rate: float = 0.0,
         ahead: float | None = None,
     ) -> Route:
-        """Simulate the way.
+        """Simulate the path.
 
         Args:
-            qpos: Configuration now. Shape (nq,).
-            speeds: Speed and yaw rate being commanded now [m/s], [rad/s].
-            name: The tracked frame; a hand looks nowhere: the base then arrives as it faces now.
-            pose: Pose of the frame now. Shape (7,).
-            goal: Its goal, which stands still. Shape (7,).
-            duration: Length of the way to look at [s].
-            turn_rate: Yaw rate of the goal; behind one that turns the base does not wait until
-                the waist is at its limit [rad/s].
-            ahead: How far ahead of the base it will be, where not as at rest [m].
+            qpos: Present configuration. Shape (nq,).
+            speeds: Commanded speed and yaw rate [m/s], [rad/s].
+            name: The tracked frame. A hand has no gaze direction: the base keeps its heading.
+            pose: Present pose of the frame. Shape (7,).
+            goal: Its stationary goal. Shape (7,).
+            duration: Duration of the path [s].
+            turn_rate: Yaw rate of the goal; the faster it turns, the sooner the base turns after
+                it, before the waist reaches its limit [rad/s].
+            ahead: Forward distance of the frame from the base at the goal; by default that at
+                rest [m].
         """
         drive, heading = self._driving, float(quat_yaw(qpos[3:7]))
         x = float(qpos[0]) + self._pivot * math.cos(heading)
@@ -234,41 +235,41 @@ class RoutePlanner:
             look = float(compute_heading(goal[3:]))
             aim = _Aim(gx, gy, look, twist, waist, resting - self._waist, drive)
         count = math.ceil(duration / _DT) + 1
-        way = _simulate(aim, x, y, heading, speeds, count)
-        if self._footprint is not None and math.dist(way[0, :2], (gx, gy)) > _DETOUR_FROM:
-            way = self._find_free(way, aim, speeds)
+        path = _simulate(aim, x, y, heading, speeds, count)
+        if self._footprint is not None and math.dist(path[0, :2], (gx, gy)) > _DETOUR_FROM:
+            path = self._find_free(path, aim, speeds)
         turns = np.zeros(count)
         if name not in self._hands:
             twist = float(compute_heading(pose[3:])) - heading
-            turns = _unwind(twist, aim.look, way[:, 2], drive.waist, drive.waist_speed)
-        offsets = way[:, :2] - (gx, gy) + _turn(aim.waist, way[:, 2])
+            turns = _unwind(twist, aim.look, path[:, 2], drive.waist, drive.waist_speed)
+        offsets = path[:, :2] - (gx, gy) + _turn(aim.waist, path[:, 2])
         offsets += _turn((aim.ahead, 0.0), aim.look + turns)
         far = np.hypot(offsets[:, 0], offsets[:, 1])
         offsets *= np.maximum(0.0, 1 - drive.lean / np.maximum(far, drive.lean))[:, None]
         twisted = abs(_wrap(aim.look - heading)) - (aim.twist or math.pi)
         share = max(float(far[0]) / drive.lean - 1.0, twisted / _TWIST_RAMP)
         share = min(max(share, 0.0), 1.0)
-        return Route(np.arange(count) * _DT, offsets, way[:, 2], turns, share)
+        return Route(np.arange(count) * _DT, offsets, path[:, 2], turns, share)
 
-    def _find_free(self, way: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:
-        """The way itself, or one with a detour where its turn is barred. Shape (n, 3)."""
+    def _find_free(self, path: np.ndarray, aim: _Aim, speeds: tuple[float, float]) -> np.ndarray:
+        """Return the path, or one with a detour if a turn on it is blocked. Shape (n, 3)."""
         footprint = self._footprint
         assert footprint is not None
 
-        def find_bar(candidate: np.ndarray) -> int | None:
+        def find_block(candidate: np.ndarray) -> int | None:
             clearance = footprint.compute_clearance(candidate[:, :2], candidate[:, 2])
-            bars = np.flatnonzero(clearance < min(clearance[0], 0.0) - _DEEPER)
-            return int(bars[0]) if len(bars) else None
+            blocks = np.flatnonzero(clearance < min(clearance[0], 0.0) - _DEEPER)
+            return int(blocks[0]) if len(blocks) else None
 
-        bar = find_bar(way)
-        if bar is None or abs(way[-1, 2] - way[bar, 2]) < _TURNED:
-            return way
-        x, y, heading = (float(each) for each in way[0])
+        block = find_block(path)
+        if block is None or abs(path[-1, 2] - path[block, 2]) < _TURNED:
+            return path
+        x, y, heading = (float(each) for each in path[0])
         for detour in _DETOURS:
-            other = _simulate(aim, x, y, heading, speeds, len(way), detour)
-            if find_bar(other) is None:
+            other = _simulate(aim, x, y, heading, speeds, len(path), detour)
+            if find_block(other) is None:
                 return other
-        return way
+        return path
 
 
 def _simulate(
@@ -280,10 +281,10 @@ def _simulate(
     count: int,
     detour: float = 0.0,
 ) -> np.ndarray:
-    """The axle's places and headings, `detour` [m] straight first. Shape (count, 3)."""
-    (v, w), way, left = speeds, np.empty((count, 3)), abs(detour)
+    """Positions and headings of the axle, after `detour` [m] straight on. Shape (count, 3)."""
+    (v, w), path, left = speeds, np.empty((count, 3)), abs(detour)
     for i in range(count):
-        way[i] = x, y, heading
+        path[i] = x, y, heading
         if left > 0:
             wanted_v, wanted_w = math.copysign(aim.driving.detour_speed, detour), 0.0
             left -= abs(v) * _DT
@@ -293,21 +294,21 @@ def _simulate(
         w += _clamp(wanted_w - w, aim.driving.turn_acceleration * _DT)
         dx, dy = _rotate(v * _DT, 0.0, heading + w * _DT / 2)
         x, y, heading = x + dx, y + dy, heading + w * _DT
-    return way
+    return path
 
 
 def _unwind(
     twist: float, look: float, headings: np.ndarray, limit: float, speed: float
 ) -> np.ndarray:
-    """Turns of the head from where its goal looks, as the waist gets there by its front [rad].
+    """Headings of the head relative to its goal while the waist turns within its range [rad].
 
-    A waist at its limit on one side, whose goal is just beyond that of the other, has to go all
-    the way back; the shortest turn of the head is barred. Shape (n,).
+    From its limit on one side to a goal just beyond the limit on the other side, the waist has to
+    turn all the way back; the shorter turn is mechanically impossible. Shape (n,).
     """
     twist, turns = _clamp(_wrap(twist), limit), np.empty(len(headings))
     for i, heading in enumerate(headings):
         wanted = _wrap(look - heading)
-        if abs(wanted) > limit:  # out of reach on either side: wait on this one
+        if abs(wanted) > limit:  # out of range on either side: wait at the limit of this one
             wanted = math.copysign(limit, twist)
         if i:
             twist += _clamp(wanted - twist, speed * _DT)
@@ -316,14 +317,14 @@ def _unwind(
 
 
 def _steer(aim: _Aim, x: float, y: float, heading: float) -> tuple[float, float]:
-    """Speed and yaw rate that are wanted of the axle at x, y [m/s], [rad/s]."""
+    """Desired speed and yaw rate of the axle at x, y [m/s], [rad/s]."""
     end = aim.clip(heading)
-    dx, dy = aim.find_way(x, y, end)
+    dx, dy = aim.find_path(x, y, end)
     turn = _wrap(end - heading)
     must_turn = aim.twist > 0 and abs(turn) > _MUST_TURN
     if math.hypot(dx, dy) >= (_CLOSE_TURNING if must_turn else _CLOSE):
         turn, dx, dy = min(
-            (_face(aim, x, y, heading, sign) for sign in (1.0, -1.0)), key=lambda way: way[0]
+            (_face(aim, x, y, heading, sign) for sign in (1.0, -1.0)), key=lambda path: path[0]
         )[1:]
     along, drive = dx * math.cos(heading) + dy * math.sin(heading), aim.driving
     v = _brake(along, drive.braking, _FINE_DRIVE) * max(0.0, math.cos(turn)) ** 4
@@ -334,11 +335,11 @@ def _steer(aim: _Aim, x: float, y: float, heading: float) -> tuple[float, float]
 def _face(
     aim: _Aim, x: float, y: float, heading: float, sign: float
 ) -> tuple[float, float, float, float]:
-    """Effort of driving forwards (1) or backwards (-1), the turn before, and the way [m]."""
+    """Effort of driving forwards (1) or backwards (-1), the turn before it, and the path [m]."""
     facing, end, dx, dy = heading, heading, 0.0, 0.0
     for _ in range(_ITERATIONS):
         end = aim.clip(facing)
-        dx, dy = aim.find_way(x, y, end)
+        dx, dy = aim.find_path(x, y, end)
         ahead, aside = _rotate(_LINE_UP, 0.0, end)
         facing = math.atan2(sign * dy + aside, sign * dx + ahead)
     turn = _wrap(facing - heading)
@@ -347,7 +348,7 @@ def _face(
 
 
 def _brake(distance: float, deceleration: float, fine: float) -> float:
-    """The largest speed from which `distance` is enough to stop, gentle at its end."""
+    """Largest speed from which a stop within `distance` is possible, linear near its end."""
     if abs(distance) < fine:
         return _FINE * distance
     return math.copysign(math.sqrt(2 * deceleration * abs(distance)), distance)
@@ -363,7 +364,7 @@ def _rotate(x: float, y: float, angle: float) -> tuple[float, float]:
 
 
 def _turn(place: tuple[float, float], headings: np.ndarray) -> np.ndarray:
-    """A place in frames of several headings. (2,), (n,) -> (n, 2)."""
+    """Rotate a vector by several headings. (2,), (n,) -> (n, 2)."""
     cosine, sine = np.cos(headings), np.sin(headings)
     return np.stack(
         [cosine * place[0] - sine * place[1], sine * place[0] + cosine * place[1]], axis=-1

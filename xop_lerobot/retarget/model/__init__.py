@@ -1,1 +1,1 @@
-"""What the planner knows: command model, kinematics, proposal and observers."""
+"""Models of the planner: command model, kinematics, kinematic proposal and observers."""

@@ -1,4 +1,7 @@
-"""What a command does, to first order: the cheap model behind proposals and the cost-to-go."""
+"""First-order model of the effect of a command, for the kinematic proposal and the cost-to-go.
+
+`CommandModel` extrapolates a configuration under a held command, and gives the derivative by it.
+"""
 
 from __future__ import annotations
 
@@ -24,25 +27,23 @@ from xop_lerobot.morphology.morphology import Morphology
 
 _TWIST = (Acts.FORWARD, Acts.LEFT, Acts.TURN)
 _TURN = 2
-_ALONG = 0.99  # cosine of the angle within which a joint turns about an axis
+_ALONG = 0.99  # cosine of the angle up to which a joint axis counts as parallel to an axis
 
 
 @dataclass(frozen=True)
 class Start:
-    """What an extrapolation starts from: a configuration, and how the robot follows its command.
-
-    Leading dimensions make a batch.
+    """Initial state of an extrapolation; leading dimensions make a batch.
 
     Attributes:
         qpos: Configuration. Shape (..., nq).
-        executed: Command executed now, from which the robot ramps at its rate limits to the next
-            one; None where it takes a command up at once. Shape (..., k).
-        drift: Base velocity beyond the commanded one: along, across [m/s], yaw rate [rad/s]; none
+        executed: Present command, from which the robot ramps at its rate limits to the next one;
+            None if commands take effect at once. Shape (..., k).
+        drift: Base velocity beyond the commanded one: along, across [m/s], yaw rate [rad/s]; zero
             by default. Shape (3,).
-        offset: Where heights and joints come to rest beside their command; none by default.
+        offset: Steady-state error of heights and joints from their command; zero by default.
             Shape (k,).
-        settled: The executed command after the robot's lags, under which its base has come to be
-            where it is; neutral by default. Shape (..., k).
+        settled: The executed command after the robot's lags, to which its present base pose
+            belongs; neutral by default. Shape (..., k).
     """
 
     qpos: np.ndarray
@@ -52,17 +53,17 @@ class Start:
     settled: np.ndarray | None = None
 
     def without_ramp(self) -> Start:
-        """The same for a command that is taken up at once, given all the time to do so."""
+        """Return the same state for a command that takes effect at once, without rate limits."""
         return Start(self.qpos, drift=self.drift, offset=self.offset, settled=self.settled)
 
 
 @dataclass(frozen=True)
 class PlannerState:
-    """All that the parts of a planner know of the robot.
+    """State of the robot as all parts of a solve see it.
 
     Attributes:
         qpos: Configuration. Shape (nq,).
-        executed: Decision that is executed now. Shape (n,).
+        executed: Decision being executed. Shape (n,).
         drift: As in `Start`. Shape (3,).
         offset: As in `Start`. Shape (n,).
         settled: As in `Start`. Shape (n,).
@@ -80,27 +81,27 @@ class PlannerState:
 
     @cached_property
     def start(self) -> Start:
-        """What extrapolations start from."""
+        """Initial state of extrapolations."""
         return Start(self.qpos, self.executed, self.drift, self.offset, self.settled)
 
 
 class CommandModel:
-    r"""Extrapolates a configuration under a command held for a time.
+    r"""Extrapolates a configuration under a command that is held for a given time.
 
-    The base moves with the commanded twist around its pivot; height and joints follow with a
-    first-order lag, :math:`q(t) = q + (a - q)(1 - e^{-t/T})`; all else stays. It knows neither
-    balance nor contacts: it only ranks and proposes, the rollout in MuJoCo decides. In
-    stationary mode a velocity that may sway the base displaces it by that much, with a lag.
+    The base moves with the commanded twist about its pivot; height and joints follow with a
+    first-order lag, :math:`q(t) = q + (a - q)(1 - e^{-t/T})`; all else stays. It models neither
+    balance nor contacts: it proposes and ranks, the rollout in MuJoCo decides. In stationary mode
+    a velocity displaces the base by `Effect.sway_s` times its change, with a lag (weight shift).
 
     Args:
         model: The robot's model.
         space: Its command space, or its decision space.
         effects: One effect for each entry.
-        pivot: Forward distance from the base's frame to its centre of turning [m].
-        rest: How a standing base leans and moves unasked; None where it does not.
+        pivot: Forward distance from the base's frame to its centre of rotation [m].
+        rest: Lean and displacement of a standing base by its policy; None if it has none.
 
     Raises:
-        UnknownName: If `rest` is about entries that are not in `space`.
+        UnknownName: If `rest` names entries that are not in `space`.
     """
 
     def __init__(
@@ -142,7 +143,7 @@ class CommandModel:
 
     @property
     def body(self) -> np.ndarray:
-        """Which entries are free to act; all at first. Shape (k,), bool."""
+        """Mask of the free entries; initially all. Shape (k,), bool."""
         return self._body
 
     @body.setter
@@ -157,15 +158,15 @@ class CommandModel:
         self._moves_base = {
             mode: bool((acting & self._is_velocity).any()) for mode, acting in self._acting.items()
         }
-        # A base leans for what is free to act; it keeps the posture that it has for all else.
+        # The lean of the base changes only if entries that it depends on are free.
         self._leans = bool(self._acting[Mode.STATIONARY][self._rest_entries].any())
 
     def acting(self, mode: Mode) -> np.ndarray:
-        """Which free entries have an effect in `mode`. Shape (k,), bool."""
+        """Mask of the free entries that have an effect in `mode`. Shape (k,), bool."""
         return self._acting[mode]
 
     def hold(self, decisions: np.ndarray, executed: np.ndarray, mode: Mode) -> np.ndarray:
-        """Decisions, with the entries that are not free: no velocity, the rest as executed.
+        """Set the entries that are not free: velocities to zero, the others as executed.
 
         Shapes (..., k), (k,) -> (..., k).
         """
@@ -174,7 +175,7 @@ class CommandModel:
         return np.where(self.acting(mode), decisions, held)
 
     def _compute_share(self, dt: float) -> np.ndarray:
-        """Share of a change that height and joints have made after `dt`. Shape (k,)."""
+        """Fraction of a step response that height and joints reach after `dt`. Shape (k,)."""
         share = self._shares.get(dt)
         if share is None:
             share = self._shares[dt] = 1 - np.exp(-dt / self._lag)
@@ -187,7 +188,7 @@ class CommandModel:
         return Acts.FORWARD in acts and Acts.LEFT not in acts
 
     def is_velocity(self) -> np.ndarray:
-        """Which entries are velocities of the base. Shape (k,), bool."""
+        """Mask of the entries that are base velocities. Shape (k,), bool."""
         return self._is_velocity
 
     def compute_twist(self, command: np.ndarray) -> np.ndarray:
@@ -204,13 +205,13 @@ class CommandModel:
     def limit_rates(
         self, executed: np.ndarray, commands: np.ndarray, mode: Mode, dt: float
     ) -> np.ndarray:
-        """What the rate limits make of command sequences with a step of `dt` [s].
+        """Apply the rate limits to command sequences with a step of `dt` [s].
 
         Shapes (k,), (K, H, k) -> (K, H, k).
         """
         step = self.space.compute_max_rate(mode, executed) * dt
         horizon = commands.shape[1]
-        if (commands == commands[:, :1]).all():  # a command that is held is approached straight
+        if (commands == commands[:, :1]).all():  # held commands (one knot) need no loop
             return self._approach(executed, commands, step * np.arange(1, horizon + 1)[:, None])
         limited = np.empty_like(commands)
         for k in range(horizon):
@@ -225,13 +226,13 @@ class CommandModel:
         return executed + self.space.straighten(np.clip(missing, -reach, reach), missing)
 
     def find_lowest_height(self) -> float:
-        """Lowest base height that can be commanded [m]; infinite where it can't be."""
+        """Lowest base height that can be commanded [m]; infinite if none can."""
         low, _ = self.space.bounds(Mode.STATIONARY)
         heights = [low[i] for i, effect in enumerate(self.effects) if effect.acts is Acts.HEIGHT]
         return float(min(heights, default=math.inf))
 
     def compute_rest_tilt(self, command: np.ndarray, mode: Mode) -> float:
-        """Tilt at which a standing base rests under a command [rad]; 0 where that is not known.
+        """Tilt at which a standing base rests under a command [rad]; 0 if unknown.
 
         Args:
             command: The command. Shape (k,).
@@ -242,13 +243,13 @@ class CommandModel:
         return abs(float(self._find_rest(command).pitch))
 
     def settle(self, settled: np.ndarray, command: np.ndarray, dt: float) -> np.ndarray:
-        """Command that the robot has taken up, with its lags, after `dt` [s] more. (..., k)."""
+        """Lagged command after `dt` [s] more of `command`. (..., k)."""
         return command + (settled - command) * np.exp(-dt / self._lag)
 
     def _ramp(
         self, command: np.ndarray, executed: np.ndarray, dt: float, mode: Mode
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the rate limits make of a command: its mean for velocities, its end for the rest.
+        """Effective command under the rate limits: mean of velocities, final value of the rest.
 
         Returns:
             The effective command and its derivative by the command. Shapes (..., k).
@@ -257,7 +258,7 @@ class CommandModel:
         asked = command - executed
         reached = np.minimum(np.maximum(asked, -reach), reach)
         inside = np.abs(asked) <= reach
-        if mode is Mode.STATIONARY:  # nothing drives
+        if mode is Mode.STATIONARY:  # velocities do not integrate: only the final value counts
             return executed + reached, inside.astype(float)
         ramp = np.abs(reached) / np.maximum(reach, 1e-12)  # share of the time spent on the ramp
         mean = reached * (1 - ramp / 2)
@@ -265,16 +266,16 @@ class CommandModel:
         return executed + np.where(self._is_velocity, mean, reached), slope
 
     def extrapolate(self, start: Start, command: np.ndarray, dt: float, mode: Mode) -> np.ndarray:
-        """Compute the configuration after `dt` of a command.
+        """Compute the configuration after holding a command for `dt`.
 
         Args:
-            start: Where the robot is.
-            command: Commands that are held. Shape (..., k).
-            dt: How long [s].
-            mode: Mode of the robot; only what acts in it has an effect.
+            start: Initial state.
+            command: Held commands. Shape (..., k).
+            dt: Duration [s].
+            mode: Mode of the robot; only entries that act in it have an effect.
 
         Returns:
-            Configurations then. Shape (..., nq).
+            Final configurations. Shape (..., nq).
         """
         qpos, offset = start.qpos, start.offset
         shape = command.shape[:-1]
@@ -299,7 +300,7 @@ class CommandModel:
         twist = self.compute_twist(command) + (0 if start.drift is None else start.drift)
         forward, left, turn = twist[..., 0], twist[..., 1], twist[..., 2]
         yaw = quat_yaw(result[..., 3:7])
-        middle = yaw + turn * dt / 2  # heading halfway: the chord of the arc
+        middle = yaw + turn * dt / 2  # heading at half time: direction of the arc's chord
         x, y = np.cos(middle), np.sin(middle)
         result[..., 0] += dt * (forward * x - left * y)
         result[..., 1] += dt * (forward * y + left * x)
@@ -312,9 +313,9 @@ class CommandModel:
     def _lean_base(
         self, qpos: np.ndarray, command: np.ndarray, settled: np.ndarray, dt: float
     ) -> None:
-        """Lean and move the base as it comes to rest under a command, in place.
+        """Lean and move the base, in place, as its policy does at rest under a command.
 
-        What counts is the difference to how it rests under `settled`: the base of now is known.
+        Applies the difference to the rest pose under `settled`, since the present pose is measured.
         """
         assert self._rest is not None
         before = self._find_rest(settled)
@@ -329,7 +330,7 @@ class CommandModel:
         qpos[..., 3:7] = quat_multiply(lean, qpos[..., 3:7])
 
     def _find_rest(self, command: np.ndarray) -> BaseRest:
-        """How a standing base rests under a command. Shape (..., k)."""
+        """Rest pose of a standing base under a command. Shape (..., k)."""
         assert self._rest is not None
         first, second = self._rest_entries
         return self._rest(command[..., first], command[..., second])
@@ -337,7 +338,7 @@ class CommandModel:
     def _sway_base(
         self, qpos: np.ndarray, command: np.ndarray, settled: np.ndarray, dt: float
     ) -> None:
-        """Shift the base over standing feet, in place."""
+        """Shift the weight over standing feet, in place."""
         shift = self.compute_twist(self._sway * self._compute_share(dt) * (command - settled))
         yaw = quat_yaw(qpos[..., 3:7])
         x, y = np.cos(yaw), np.sin(yaw)
@@ -349,13 +350,13 @@ class CommandModel:
     ) -> tuple[np.ndarray, np.ndarray]:
         r"""Compute one extrapolation and :math:`\partial\phi_\tau(q, a)/\partial a`.
 
-        Arguments as for `extrapolate`, without leading dimensions; plain numbers instead of
-        arrays make it fast. The derivative is in MuJoCo's tangent space: linear velocity of the
-        base in the world, its angular velocity in the body.
+        Arguments as for `extrapolate`, without leading dimensions; plain floats instead of arrays
+        make it fast. The derivative is in MuJoCo's tangent space: linear velocity of the base in
+        the world frame, its angular velocity in the body frame.
 
         Returns:
-            Configuration then, shape (nq,), and its derivative, shape (nv, k), zero for entries
-            that do not act.
+            Final configuration, shape (nq,), and its derivative, shape (nv, k), zero for entries
+            without effect.
         """
         qpos, offset, slope = start.qpos, start.offset, np.ones(len(command))
         if start.executed is not None:
@@ -390,7 +391,7 @@ class CommandModel:
         share: np.ndarray,
         yaw: float,
     ) -> None:
-        """Lean and move the base as it comes to rest under a command; see `_lean_base`."""
+        """Lean and move the base at rest under a command; see `_lean_base`."""
         before = self._find_rest(settled)
         after = self._find_rest(settled + share * (command - settled))
         cosine, sine = math.cos(yaw), math.sin(yaw)
@@ -418,7 +419,7 @@ class CommandModel:
         share: np.ndarray,
         yaw: float,
     ) -> None:
-        """Shift the base over standing feet; see `_sway_base`."""
+        """Shift the weight over standing feet; see `_sway_base`."""
         axes = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
         gain = self._sway * share
         for i, acts in self._twist:
@@ -447,7 +448,7 @@ class CommandModel:
         )
         columns = ((dt * cosine, dt * sine), (-dt * sine, dt * cosine), turning)
         w, x, y, z = (float(value) for value in future[3:7])
-        # A turn about the vertical, seen from the body: R^T e_z, which the turn leaves alone.
+        # The vertical in the body frame, R^T e_z; a turn about it leaves it unchanged.
         axis = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         for i, acts in self._twist:
             if self._acting[Mode.MOBILE][i]:
@@ -465,13 +466,13 @@ class CommandModel:
 def find_joints_along(
     morphology: Morphology, model: mujoco.MjModel, command_model: CommandModel, axis: int
 ) -> np.ndarray:
-    """Which entries of the command turn a joint about an axis of the robot, as it stands.
+    """Mask of the entries whose joint axis is parallel to a body axis in the standing posture.
 
     Args:
         morphology: The robot.
         model: Its model.
-        command_model: What the entries do.
-        axis: 0 ahead (a roll), 1 to the left (a nod), 2 upwards (a turn).
+        command_model: Model with the effects of the entries.
+        axis: 0 forward (roll), 1 left (pitch), 2 up (yaw).
 
     Returns:
         Shape (k,), bool.

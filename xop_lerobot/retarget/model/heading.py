@@ -1,4 +1,4 @@
-"""Heading and tilt errors of one orientation, with their derivative; the fast scalar path."""
+"""Heading and tilt errors of a single orientation, with their Jacobian, in fast scalar code."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ _TINY = 1e-12
 
 
 def linearise_heading(goal: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Compute the error of `heading_error` and how the orientation changes it.
+    r"""Compute `heading_error` of one orientation, and its Jacobian.
 
     With :math:`d = q_{goal} q^{-1} = R_z(\psi)\,s`, an angular velocity ω (world axes) changes the
-    turn by :math:`\dot\psi = -h^\top\omega`, with :math:`h = (-u_y, u_x, 1)` and
-    :math:`u = s_{x,y}/s_w`, and the tilt's error :math:`e = \log s` by
+    heading error by :math:`\dot\psi = -h^\top\omega`, with :math:`h = (-u_y, u_x, 1)` and
+    :math:`u = s_{x,y}/s_w`, and the tilt error :math:`e = \log s` by
     :math:`-(J_r^{-1}(e) - J_l^{-1}(e)\,e_z h^\top)\,\omega`.
 
     Args:
-        goal: Wanted orientation wxyz. Shape (4,).
+        goal: Desired orientation wxyz. Shape (4,).
         quat: Orientation wxyz. Shape (4,).
 
     Returns:
-        Errors of the tilt about X and Y, and of the heading [rad], shape (3,), and the derivative
-        of their negative by ω, shape (3, 3).
+        Tilt errors about X and Y and heading error [rad], shape (3,), and the negative of their
+        derivative by ω, shape (3, 3).
 
     References:
         Solà et al., A micro Lie theory for state estimation in robotics, Eq. 144.
@@ -38,9 +38,9 @@ def linearise_heading(goal: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, n
     scale = 2 * math.atan2(level, upright) / level if level > _TINY else 2.0
     ex, ey = scale * sx, scale * sy
     error = np.array([ex, ey, 2 * math.atan2(z, w)])
-    spin = np.array([-sy / upright, sx / upright, 1.0])  # by which ω turns the heading
+    spin = np.array([-sy / upright, sx / upright, 1.0])  # h: rate of the heading per ω
     by_rotation = _inverse_right_jacobian(ex, ey)
-    jacobian = by_rotation - np.outer(by_rotation[2], spin)  # its transpose is the left one's
+    jacobian = by_rotation - np.outer(by_rotation[2], spin)  # J_l^{-1} e_z is a row of J_r^{-1}
     jacobian[2] = spin
     return error, jacobian
 
@@ -62,7 +62,7 @@ def _inverse_right_jacobian(x: float, y: float) -> np.ndarray:
     r""":math:`J_r^{-1}(e) = I + [e]_\times/2 + c\,[e]_\times^2` of e = (x, y, 0). Shape (3, 3)."""
     square = x * x + y * y
     angle = math.sqrt(square)
-    if angle < 1e-3:  # the next term of the series is of the order of angle²/720
+    if angle < 1e-3:  # limit of the series; its next term is angle²/720
         factor = 1 / 12
     else:
         factor = 1 / square - (1 + math.cos(angle)) / (2 * angle * math.sin(angle))

@@ -1,4 +1,4 @@
-"""Forward kinematics of a few sites for a whole batch of configurations at once."""
+"""Batched forward kinematics of sites in NumPy, for long trajectories."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ _HINGE, _SLIDE, _FREE = (
 class SiteKinematics:
     r"""Pose of sites as a function of :math:`q`, broadcast over any leading dimensions.
 
-    For a long batch, one NumPy pass over the bodies on the way to the sites is faster than a loop
-    over `mj_kinematics`; for some hundred configurations or less see `Placement`. The local
-    transforms of all joints are computed together,
-    :math:`R = R_0 (I + \sin q\,K + (1 - \cos q) K^2)`, and then chained
-    body by body. Here q counts from the joint's reference angle, as in MuJoCo.
+    For a large batch, one NumPy pass over the bodies between the root and the sites is faster than
+    a loop over `mj_kinematics`; below a few hundred configurations use `Placement`. The local
+    transforms of all joints are computed together by Rodrigues' formula,
+    :math:`R = R_0 (I + \sin q\,K + (1 - \cos q) K^2)`, and then chained body by body. Here q
+    counts from the joint's reference angle, as in MuJoCo.
 
     Args:
         model: Model whose bodies carry at most one free, hinge or slide joint each.
         sites: Names of the sites.
 
     Raises:
-        UnknownName: If a site is not in the model; carries its sites.
-        BadValue: If a body on the way has a ball joint, or two joints.
+        UnknownName: If a site is not in the model; lists its sites.
+        BadValue: If a body in the chain has a ball joint, two joints, or a joint off its origin.
     """
 
     def __init__(self, model: mujoco.MjModel, sites: tuple[str, ...]) -> None:
         self._sites: dict[str, tuple[int, np.ndarray]] = {}
-        ways: set[int] = set()
+        chains: set[int] = set()
         for name in sites:
             site = model.site(find_site(model, name))
             body = int(site.bodyid[0])
             self._sites[name] = (body, _make_transform(site.pos, site.quat))
-            ways.update(_find_chain(model, body))
-        self._bodies = bodies = sorted(ways)
+            chains.update(_find_chain(model, body))
+        self._bodies = bodies = sorted(chains)
         for body in bodies:
             _check_body(model, body)
         self._parent = {body: int(model.body_parentid[body]) for body in bodies}
@@ -83,7 +83,7 @@ class SiteKinematics:
         return poses
 
     def _compute_world(self, flat: np.ndarray) -> dict[int, np.ndarray]:
-        """World transform of each body on the way. Shapes (n, 4, 4)."""
+        """World transform of each body in the chains. Shapes (n, 4, 4)."""
         local = self._compute_local(flat)
         still = np.broadcast_to(np.eye(4), (len(flat), 4, 4))
         world: dict[int, np.ndarray] = {0: still}  # sites may be on the world itself
@@ -111,7 +111,7 @@ class SiteKinematics:
 
 
 def _find_chain(model: mujoco.MjModel, body: int) -> list[int]:
-    """Bodies from the world (excluded) to `body`."""
+    """Bodies from the world (exclusive) to `body`."""
     chain = []
     while body:
         chain.append(body)

@@ -1,4 +1,8 @@
-"""Places and derivatives of one configuration, by MuJoCo, and poses that the costs ask for."""
+"""Forward kinematics and Jacobians by MuJoCo, and the poses and positions that cost terms need.
+
+`Linearisation` differentiates one configuration, `Placement` evaluates small batches, and
+`Readings` reads the same quantities from the sensor data of rollouts.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ from xop_lerobot.retarget.static_load import StaticLoad
 
 
 def find_site(model: mujoco.MjModel, name: str) -> int:
-    """Return the number of a site.
+    """Return the id of a site.
 
     Raises:
         UnknownName: Listing the model's sites.
@@ -27,7 +31,7 @@ def find_site(model: mujoco.MjModel, name: str) -> int:
 
 
 def find_sites_on(model: mujoco.MjModel, body: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Those of the sites `names` that are on a body."""
+    """Select the sites among `names` that are attached to a body."""
     wanted = model.body(body).id
     return tuple(n for n in names if model.site_bodyid[find_site(model, n)] == wanted)
 
@@ -35,7 +39,7 @@ def find_sites_on(model: mujoco.MjModel, body: str, names: Iterable[str]) -> tup
 class Linearisation:
     r"""Kinematics and Jacobians at one configuration at a time.
 
-    A pass over the tree is 4 µs, a Jacobian 1 µs; for batches see `SiteKinematics`.
+    A pass over the kinematic tree takes 4 µs, a Jacobian 1 µs; for batches see `SiteKinematics`.
 
     Args:
         model: The robot's model.
@@ -45,17 +49,17 @@ class Linearisation:
         self.model, self._data = model, mujoco.MjData(model)
 
     def update(self, qpos: np.ndarray) -> None:
-        """Place all bodies at `qpos`. Shape (nq,)."""
+        """Update the kinematics to `qpos`. Shape (nq,)."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self._data)
         mujoco.mj_comPos(self.model, self._data)
 
     def compute_site(self, site: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        r"""Place a site.
+        r"""Compute pose and Jacobians of a site.
 
         Returns:
             Position [m] (3,), orientation wxyz (4,), and the Jacobians of its linear and angular
-            velocity in the world by :math:`\dot q`. Shapes (3, nv), (3, nv).
+            velocity in world axes by :math:`\dot q`. Shapes (3, nv), (3, nv).
         """
         quat = np.empty(4)
         mujoco.mju_mat2Quat(quat, self._data.site_xmat[site])
@@ -71,21 +75,21 @@ class Linearisation:
         return self._data.subtree_com[body], jacobian
 
     def compute_load(self, load: StaticLoad) -> tuple[np.ndarray, np.ndarray]:
-        """Static loads beyond their share (n,), and their Jacobian (n, nv)."""
+        """Static loads beyond their allowed share (n,), and their Jacobian (n, nv)."""
         return load.linearise_excess(self._data)
 
 
 class Placement:
-    """Places sites and the centre of mass in a small batch of configurations.
+    """Forward kinematics of sites and centre of mass for a small batch of configurations.
 
-    One pass of MuJoCo for each, 4 µs: up to some hundred configurations that is faster than
-    NumPy's pass over the tree for all of them at once.
+    One MuJoCo pass of 4 µs each: up to a few hundred configurations that is faster than one NumPy
+    pass over the tree for all of them (`SiteKinematics`).
 
     Args:
         model: The robot's model.
-        poses: Sites whose poses are asked for.
-        points: Sites whose positions are asked for.
-        com_of: Body whose subtree's centre of mass is asked for, None if none is.
+        poses: Sites whose poses to compute.
+        points: Sites whose positions to compute.
+        com_of: Body whose subtree's centre of mass to compute; None for no centre of mass.
     """
 
     def __init__(
@@ -100,7 +104,7 @@ class Placement:
         self._pose_ids = [find_site(model, site) for site in poses]
         self._ids = np.array([find_site(model, site) for site in (*poses, *points)], dtype=int)
         self._com = model.body(com_of).id if com_of else None
-        # Views of what MuJoCo writes: to look an attribute up takes as long as to copy it.
+        # Keep views of MuJoCo's arrays: an attribute lookup takes as long as the copy itself.
         data = self._data
         self._qpos, self._site_xpos = data.qpos, data.site_xpos
         self._matrices = [data.site_xmat[site] for site in self._pose_ids]
@@ -109,11 +113,11 @@ class Placement:
     def compute(
         self, qpos: np.ndarray
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray]:
-        """Place everything. Shape (n, nq).
+        """Compute poses, positions and centre of mass. Shape (n, nq).
 
         Returns:
             Poses of the sites, shapes (n, 7); positions of the points, shapes (n, 3); centre of
-            mass, shape (n, 3), or (0,) where none was asked for.
+            mass, shape (n, 3), or (0, 3) if none was requested.
         """
         model, data = self.model, self._data
         positions = np.empty((len(qpos), len(self._ids), 3))
@@ -138,12 +142,12 @@ class Placement:
 
 
 class Parts(NamedTuple):
-    """Places of a batch of states; leading dimensions as asked.
+    """Poses and positions in a batch of states, with its leading dimensions.
 
     Attributes:
         poses: Pose of each tracked frame. Shapes (..., 7).
         points: Position of contact and hull sites [m]. Shapes (..., 3).
-        velocities: Velocity of contact sites [m/s]; only of rollouts. Shapes (..., 3).
+        velocities: Velocity of contact sites [m/s]; only in rollouts. Shapes (..., 3).
         com: Centre of mass [m]; empty for a robot without a support area. Shape (..., 3).
     """
 
@@ -154,12 +158,12 @@ class Parts(NamedTuple):
 
 
 class Readings:
-    """Reads rollouts' sensor data, and places the sites of other configurations.
+    """Poses and positions from the sensor data of rollouts, or from configurations.
 
     Args:
         morphology: The robot.
         model: Its planning model.
-        hull: Sites that obstacles are avoided with.
+        hull: Hull sites for obstacle avoidance, with their radii [m].
     """
 
     def __init__(
@@ -187,12 +191,12 @@ class Readings:
         return self._get_placement(()).compute(qpos[None])[2][0]
 
     def place(self, qpos: np.ndarray, frames: Mapping[str, str]) -> Parts:
-        """Places in configurations, (n, nq): tracked frames, hull and centre of mass."""
+        """Poses, hull points and centre of mass in configurations, (n, nq)."""
         poses, points, com = self._get_placement(tuple(frames.values())).compute(qpos)
         return Parts({name: poses[site] for name, site in frames.items()}, points, {}, com)
 
     def read(self, sensordata: np.ndarray, frames: Mapping[str, str]) -> Parts:
-        """Places in rollouts, from `Prediction.sensordata`, (K, H + 1, n)."""
+        """Poses and points in rollouts, from `Prediction.sensordata`, (K, H + 1, n)."""
         sensing = self._sensing
         return Parts(
             {name: sensing.read_pose(sensordata, site) for name, site in frames.items()},

@@ -1,4 +1,8 @@
-"""Observers of what a command does not explain: drift of the base, and offsets at rest."""
+"""Disturbance observers of the command model: base drift, and steady-state offsets of joints.
+
+Both estimate the part of the measured motion that the command model does not explain. Added to its
+predictions, they make the controller free of steady-state offset.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import numpy as np
 from xop_lerobot.core.transforms import quat_yaw, wrap_angle
 from xop_lerobot.retarget.model.command_model import CommandModel
 
-_MAX = np.array([0.3, 0.3, 0.4])  # [m/s, m/s, rad/s]; more is a stumble, not a drift
+_MAX = np.array([0.3, 0.3, 0.4])  # largest drift [m/s, m/s, rad/s]; beyond it is a stumble
 
 
 class DriftObserver:
@@ -15,17 +19,20 @@ class DriftObserver:
 
     .. math:: b \leftarrow b + (1 - e^{-dt/\tau})(v_{measured} - v_{command} - b)
 
-    along and across the heading, and about the vertical. The command counts with the lag of a
-    policy that takes it up, or else every start and stop would look like a drift. A walking
-    policy drifts by several centimetres a second, by more when it leans; the horizon is too
-    short to tell that from the sway of the gait. With b in the extrapolated terminal cost the
-    controller has no steady offset (an output disturbance model, as in offset-free model
-    predictive control, Pannocchia and Rawlings, 2003).
+    along and across the heading, and about the vertical. The command is lagged like the policy's
+    response; otherwise every start and stop would look like drift. A walking policy drifts by
+    several centimetres per second, more when it leans; the horizon is too short to tell that from
+    the sway of the gait. With b in the extrapolated terminal cost the controller has no steady
+    offset (an output disturbance model, as in offset-free model predictive control, Pannocchia and
+    Rawlings, 2003).
 
     Args:
-        command_model: What a command asks of the base.
+        command_model: Gives the commanded base velocity.
         time_constant: τ [s], several strides.
-        lag_s: Time constant with which the base takes a command up; may be 0 [s].
+        lag_s: Time constant of the base's response to a command; may be 0 [s].
+
+    Attributes:
+        drift: b: along, across [m/s], yaw rate [rad/s]. Shape (3,).
     """
 
     def __init__(
@@ -41,18 +48,18 @@ class DriftObserver:
         self._last: tuple[float, np.ndarray] | None = None
 
     def update(self, time: float, qpos: np.ndarray, command: np.ndarray, moving: bool) -> None:
-        """Take the base's pose at `time` [s] and the command executed since the last one.
+        """Update with the base pose at `time` and the command executed since the last update.
 
         Args:
             time: The robot's clock [s].
             qpos: Configuration. Shape (nq,).
             command: Command. Shape (k,).
-            moving: Whether the base follows velocities at all; if not, there is no drift.
+            moving: Whether the base follows velocity commands; if not, the drift is zero.
         """
         if not np.isfinite(qpos[:7]).all():
             return
         yaw = float(quat_yaw(qpos[3:7]))
-        # The point about which the base turns: turning alone does not move it.
+        # Track the centre of rotation, which pure turning does not move.
         pivot = self.command_model.pivot * np.array([np.cos(yaw), np.sin(yaw)])
         planar = np.array([*(qpos[:2] + pivot), yaw])
         last, self._last = self._last, (time, planar)
@@ -76,24 +83,24 @@ class DriftObserver:
         self.drift = np.clip(self.drift + gain * (excess - self.drift), -_MAX, _MAX)
 
 
-_QUIET = 0.03  # distance of the lagged command from the command at which a robot rests, of scale
+_QUIET = 0.03  # error of the lagged command below which an entry has settled [half ranges]
 
 
 class OffsetObserver:
-    r"""Low-passed difference between height and joints and what was commanded, at rest.
+    r"""Low-passed difference of height and joints from their command, at rest.
 
     .. math:: \bar a \leftarrow a + (\bar a - a)e^{-dt/T},\qquad
               o \leftarrow o + (1 - e^{-dt/\tau})(q - \bar a - o)
 
-    A low-level policy holds a waist or a height beside the command, by a few hundredths, to keep
-    its balance. The short horizon sees the motion towards the command, not where it ends. With o
-    in the extrapolated terminal cost the controller has no steady offset, as with the drift of a
-    walking base. It learns only where the lagged command \bar a has caught up with a.
+    To keep its balance, a low-level policy holds waist or height a few hundredths off the command.
+    The short horizon sees the motion towards the command, not where it ends. With o in the
+    extrapolated terminal cost the controller has no steady offset, as with the drift of a walking
+    base. An entry learns only while its lagged command \bar a has converged to a.
 
     Args:
-        command_model: What a command does, and with what lag.
+        command_model: Gives the lags.
         time_constant: τ [s].
-        largest: Largest offset, in shares of a command's scale.
+        largest: Bound of the offset, as a fraction of half the range of an entry [1].
 
     Attributes:
         settled: The lagged command. Shape (k,).
@@ -110,7 +117,7 @@ class OffsetObserver:
         self.reset(space.neutral)
 
     def reset(self, command: np.ndarray) -> None:
-        """Forget everything: the robot rests at `command`. Shape (k,)."""
+        """Reset the offsets; the robot is at rest at `command`. Shape (k,)."""
         self.settled = np.array(command, dtype=float)
         self.offset = np.zeros(len(self.settled))
         self._last: float | None = None
@@ -118,13 +125,13 @@ class OffsetObserver:
     def update(
         self, time: float, qpos: np.ndarray, command: np.ndarray, *, learns: bool = True
     ) -> None:
-        """Take what has happened since the last call.
+        """Update with the configuration at `time` and the command since the last update.
 
         Args:
             time: The robot's clock [s].
             qpos: Configuration. Shape (nq,).
-            command: Command executed since then. Shape (k,).
-            learns: Whether offsets are counted on; if not, they are forgotten.
+            command: Command executed since the last update. Shape (k,).
+            learns: Whether to estimate offsets; if not, they are zero.
         """
         last, self._last = self._last, time
         if last is None or time <= last:

@@ -1,4 +1,8 @@
-"""The posture in which a robot would be at a goal, looked for from several starts."""
+"""Multi-start search for the posture of a robot at a goal.
+
+`PostureSearch` solves the least squares of `KinematicProposal` without rate limits from several
+initial guesses, among them random postures of a `Repertoire`.
+"""
 
 from __future__ import annotations
 
@@ -26,28 +30,29 @@ from xop_lerobot.retarget.model.proposal import KinematicProposal, ProposalWeigh
 from xop_lerobot.retarget.static_load import StaticLoad
 
 AT_REST_S = 20.0
-"""Time after which a robot has taken a command up, whatever its lags [s]."""
-_COUNT = 1000  # postures that are drawn at first
-MISSED = 4e-4  # cost from which a goal counts as missed, and others are tried: 2 cm
-_BETTER, _SHARE = 4e-4, 0.95  # by which, and to what share, another posture must be cheaper
-_PERIOD = 25  # solves after which another start is tried though nothing is missed
-_MOVED, _TURNED = 0.01, 0.03  # by which a goal has to move to be looked at anew [m], [rad]
-_NEARBY, _OTHER = 4, 12  # iterations from the last posture, and from elsewhere
-_STARTS = 7  # starts that are tried in turn; odd: each within the limits, then beyond
-_FAR = 0.12  # distance of a posture from which on the way there is looked at, of scale
-_ARRIVED = 0.05  # distance at which a detour has come to its end
-_NEARER, _PATIENCE = 0.02, 8  # by which a posture has to come nearer within so many solves
-_STUCK = 1.6e-3  # cost from which on it has to: 4 cm
+"""Time after which a robot has settled on a command, whatever its lags [s]."""
+_COUNT = 1000  # random postures that are drawn
+MISSED = 4e-4  # cost above which a goal counts as missed and other starts are tried: (2 cm)²
+# Margin and factor by which another posture must be cheaper, so that the search does not oscillate.
+_BETTER, _SHARE = 4e-4, 0.95
+_PERIOD = 25  # solves after which another start is tried although the goal is met
+_MOVED, _TURNED = 0.01, 0.03  # change of a goal that restarts the search [m], [rad]
+_NEARBY, _OTHER = 4, 12  # iterations from the last posture, and from another start
+_STARTS = 7  # starts tried in turn; odd, so that each is tried within and beyond the limits
+_FAR = 0.12  # distance to the posture above which detours are detected [half ranges]
+_ARRIVED = 0.05  # distance at which a detour ends [half ranges]
+_NEARER, _PATIENCE = 0.02, 8  # progress [half ranges] expected within a number of solves
+_STUCK = 1.6e-3  # cost above which that progress is expected: (4 cm)²
 
 
 class Found(NamedTuple):
-    """A posture that has been found.
+    """Result of a posture search.
 
     Attributes:
-        command: The command that holds it. Shape (k,).
-        missed: What it misses of the goal, squared and weighted.
-        detour: Whether the way there leads away from the goal at first: from where the robot is,
-            no small change of its posture brings it nearer.
+        command: The command that holds the posture. Shape (k,).
+        missed: Weighted squared error from the goal.
+        detour: Whether the path to it leads away from the goal at first: no small change of the
+            present posture brings the robot closer.
     """
 
     command: np.ndarray
@@ -56,20 +61,20 @@ class Found(NamedTuple):
 
 
 class Repertoire:
-    """Postures that a robot can hold: drawn at random, and those that it cannot hold dropped.
+    """Random postures that the robot can hold statically.
 
     Args:
         model: The robot's model.
-        command_model: What a command does.
+        command_model: First-order model of the effect of a command.
         standing: Configuration in which it stands at the origin. Shape (nq,).
         site: Site of the head.
         base_body: The robot's root body.
-        support: Area over which the centre of mass stays; None for one that balances itself.
-        load: What joints bear of the weight above them.
+        support: Support area for the centre of mass; None for a robot that balances itself.
+        load: Static loads of the joints.
 
     Attributes:
-        commands: The commands that hold them. Shape (n, k).
-        poses: Poses of the head in them. Shape (n, 7).
+        commands: Commands of the postures. Shape (n, k).
+        poses: Head poses in the postures. Shape (n, 7).
     """
 
     def __init__(
@@ -99,39 +104,38 @@ class Repertoire:
     def choose(
         self, base: np.ndarray, goal: np.ndarray, weights: ProposalWeights, count: int
     ) -> np.ndarray:
-        """The commands whose postures come nearest to a goal, for a base at `base`.
+        """Commands of the `count` postures closest to a goal, for a base at `base`.
 
         Shapes (7,), (7,) -> (n, k).
         """
-        poses = pose_multiply(make_level(base), self.poses)
+        poses = pose_multiply(_project_on_ground(base), self.poses)
         error = sum_squares((poses[:, :3] - goal[:3]) * weights.position)
         turn, tilt = compute_heading_squares(goal[3:], poses[:, 3:])
         error += weights.orientation[2] ** 2 * turn + weights.orientation[0] ** 2 * tilt
         return self.commands[np.argsort(error)[:count]]
 
 
-def make_level(base: np.ndarray) -> np.ndarray:
-    """Place on the ground and heading of a base. Shape (7,)."""
+def _project_on_ground(base: np.ndarray) -> np.ndarray:
+    """Pose of a base with height and tilt set to zero. Shape (7,)."""
     return make_pose(np.array([*base[:2], 0.0]), quat_from_yaw(quat_yaw(base[3:])))
 
 
 class PostureSearch:
-    r"""Looks for the command that a robot at its goal would hold, whatever the way there.
+    r"""Finds the command that a robot at its goal would hold, regardless of the path there.
 
-    The least squares of `KinematicProposal` without limits of rates, on a robot that has come to
-    rest. They have local minima: knees that fold to the front or to the back, a waist that would
-    have to go round the other way. So the last solution is followed, and while it misses the
-    goal, and now and then anyway, another start is tried at each call: the robot's own posture,
-    the neutral one, and those of a `Repertoire` that come nearest to the goal. The better one is
-    taken.
+    It solves the least squares of `KinematicProposal` without rate limits, for a robot at rest.
+    They have local minima: knees that bend forward or backward, a waist turned the other way
+    round. So each call starts from the last solution; while that misses the goal, and from time to
+    time anyway, one more start is tried: the executed posture, the neutral one, or one of those in
+    a `Repertoire` that are closest to the goal. The better solution is kept.
 
     Args:
-        problem: The least squares.
-        repertoire: Postures to start from.
+        problem: The least-squares problem.
+        repertoire: Random postures to start from.
         used: Entries that make the posture; the others stay neutral. Shape (k,), bool.
-        limits: Bounds within which a posture is looked for. Shapes (k,).
-        strict: Whether it stays within them even where a goal can be reached beyond them alone.
-        looks_at_way: Whether it tells detours.
+        limits: Preferred bounds of a posture. Shapes (k,).
+        strict: Whether the bounds hold even if only a posture beyond them reaches the goal.
+        detects_detours: Whether it detects detours.
     """
 
     def __init__(
@@ -142,13 +146,13 @@ class PostureSearch:
         limits: tuple[np.ndarray, np.ndarray],
         *,
         strict: bool = False,
-        looks_at_way: bool = True,
+        detects_detours: bool = True,
     ) -> None:
         self.problem, self._repertoire, self._used = problem, repertoire, used
         self.space = problem.command_model.space
         self._limits = self._restrict(limits)
         self._everywhere = self._restrict((self.space.low, self.space.high))
-        self._strict, self._looks_at_way = strict, looks_at_way
+        self._strict, self._detects_detours = strict, detects_detours
         self.reset()
 
     def _restrict(self, bounds: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +173,7 @@ class PostureSearch:
 
         Args:
             name: The tracked frame.
-            state: Where the robot is, with the command that it executes.
+            state: The planner's state, with the executed command.
             goal: Its goal. Shape (7,).
         """
         qpos, executed = state.qpos, state.executed
@@ -177,9 +181,9 @@ class PostureSearch:
         free = self._used & self.problem.command_model.acting(Mode.STATIONARY)
         moved = self._note(qpos, goal)
         apart = self._compute_apart(executed)
-        is_close = apart <= _FAR or not self._looks_at_way
+        is_close = apart <= _FAR or not self._detects_detours
         if not moved and is_close and not self._detours and self._last is not None:
-            # A few solves are enough for a goal that stays, whether it is met or out of reach.
+            # A constant goal needs no more solves once it is met or known to be out of reach.
             rests = self._found.missed <= MISSED or self._tries >= 4 * _STARTS
             self._quiet += 1
             if rests and self._quiet < _PERIOD:
@@ -203,7 +207,7 @@ class PostureSearch:
 
         start = executed if self._last is None else self._last
         best = solve(start, _NEARBY, everywhere if self._beyond else self._limits)
-        if self._beyond and best.missed > MISSED:  # there is no need to be beyond
+        if self._beyond and best.missed > MISSED:  # beyond the limits without reaching the goal
             self._beyond = False
             best = solve(start, _OTHER, self._limits)
         if best.missed > MISSED or self._quiet >= _PERIOD:
@@ -217,9 +221,11 @@ class PostureSearch:
                 best, self._beyond = other, beyond
         self._last = best.command
         left = self._compute_apart(executed)
-        if left <= _FAR or not self._looks_at_way:
+        if left <= _FAR or not self._detects_detours:
             self._detours = self._detours and left > _ARRIVED
         else:
+            # Local solution from the executed posture: if it is worse, or the robot makes no
+            # progress towards the posture found, moving there is a detour.
             near = solve(executed, _OTHER, (np.minimum(low, executed), np.maximum(high, executed)))
             elsewhere = _SHARE * near.cost > best.cost + _BETTER
             self._detours |= elsewhere or self._is_stuck(left, solve(executed, 1, everywhere))
@@ -231,18 +237,18 @@ class PostureSearch:
         return self._found
 
     def _compute_apart(self, executed: np.ndarray) -> float:
-        """Largest distance of the posture executed from the last one found, of scale."""
+        """Largest distance of the executed posture from the last one found [half ranges]."""
         if self._last is None:
             return np.inf
         model = self.problem.command_model
-        heeded = self._used & model.acting(Mode.STATIONARY) & ~model.is_velocity()
-        apart = np.abs(self._last - executed)[heeded] / self.problem.scale[heeded]
+        relevant = self._used & model.acting(Mode.STATIONARY) & ~model.is_velocity()
+        apart = np.abs(self._last - executed)[relevant] / self.problem.scale[relevant]
         return float(apart.max(initial=0.0))
 
     def _note(self, qpos: np.ndarray, goal: np.ndarray) -> bool:
-        """Whether a goal has moved, as far as it counts, on the base; if so take note of it."""
-        weights, base = self.problem.weights, make_level(qpos[:7])
-        if not weights.orientation[2]:
+        """Whether the weighted part of a goal has moved relative to the base; records it if so."""
+        weights, base = self.problem.weights, _project_on_ground(qpos[:7])
+        if not weights.orientation[2]:  # the heading has no weight: ignore turns of the base
             base = make_pose(base[:3], quat_from_yaw(compute_heading(goal[3:])))
         place = pose_multiply(pose_inverse(base), goal)
         if self._noted is not None:
@@ -254,22 +260,23 @@ class PostureSearch:
         return True
 
     def _is_stuck(self, left: float, now: Solution) -> bool:
-        """Whether a robot that misses its goal has not come nearer to the posture for a while."""
+        """Whether a robot that misses its goal makes no progress towards the posture."""
         if now.missed <= _STUCK or left < self._left - _NEARER:
             self._left, self._waited = left, 0
         self._waited += 1
         return self._waited > _PATIENCE
 
     def _choose_start(self, qpos: np.ndarray, goal: np.ndarray, executed: np.ndarray) -> np.ndarray:
-        """The start whose turn it is. Shape (k,)."""
+        """The next initial guess. Shape (k,)."""
         turn = self._turn % _STARTS
         self._turn += 1
         if turn == 0:
             return executed
         if turn == 1:
             return self.space.neutral
+        # Alternate between the closest postures and the next closest ones.
         count, second = _STARTS - 2, self._turn // _STARTS % 2
         starts = self._repertoire.choose(qpos[:7], goal, self.problem.weights, 2 * count)
-        if not len(starts):  # no posture that was drawn holds
+        if not len(starts):  # none of the random postures can be held
             return self.space.neutral
         return starts[(second * count + turn - 2) % len(starts)]

@@ -1,4 +1,8 @@
-"""The kinematic proposal: the command that would reach the goal if the robot were ideal."""
+"""Kinematic proposal: the command with which an ideal robot would reach its goals in a given time.
+
+`KinematicProposal` is a box-constrained, damped nonlinear least-squares solver over the
+`CommandModel`.
+"""
 
 from __future__ import annotations
 
@@ -20,18 +24,18 @@ from xop_lerobot.retarget.model.heading import linearise_heading
 from xop_lerobot.retarget.model.linearisation import Linearisation, find_site
 from xop_lerobot.retarget.static_load import StaticLoad
 
-_DAMPING = 1e-3  # of the first step, in shares of a command's scale
-_CONVERGED = 1e-3  # a step that small ends the iteration, in shares of a command's scale
-_DAQP_OPTIMAL = 1
+_DAMPING = 1e-3  # initial Levenberg-Marquardt damping, for entries in half ranges
+_CONVERGED = 1e-3  # largest entry of a step that ends the iteration [half ranges]
+_DAQP_OPTIMAL = 1  # DAQP's exit flag for an optimal solution
 
 
 class Solution(NamedTuple):
-    """A command, and what it costs.
+    """A command and its cost.
 
     Attributes:
         command: The command. Shape (k,).
-        cost: The sum of squares.
-        missed: That of the errors, without efforts.
+        cost: Total sum of squares.
+        missed: Sum of squares of the residuals without effort and change.
     """
 
     command: np.ndarray
@@ -41,17 +45,17 @@ class Solution(NamedTuple):
 
 @dataclass(frozen=True)
 class ProposalWeights:
-    """Weights of the proposal's least squares.
+    """Weights of the proposal's residuals; the cost is their sum of squares.
 
     Attributes:
-        position: Of the position error along x, y, z [1/m].
-        orientation: Of the tilt about X and Y and of the heading, as in `heading_error` [1/rad].
-        effort: Of the command's distance from the natural one, over its scale [1].
-        change: Of its distance from the executed command, over its scale [1].
-        support: Of the centre of mass beyond the support area [1/m].
-        lean: Of the centre of mass from where it rests on the base [1/m].
-        load: Of static torques beyond their share of what a motor can [1].
-        lateral: Of the heading of a base on wheels beside where it shall face [1/rad].
+        position: Position error along x, y, z [1/m].
+        orientation: Tilt about X and Y, then heading, as in `heading_error` [1/rad].
+        effort: Distance of the command from the natural one, in half ranges [1].
+        change: Distance of the command from the executed one, in half ranges [1].
+        support: Distance of the centre of mass beyond the support area [1/m].
+        lean: Distance of the centre of mass from its rest position on the base [1/m].
+        load: Static torques beyond their allowed share of the motor limits [1].
+        lateral: Heading error of a wheeled base [1/rad].
     """
 
     position: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -65,12 +69,12 @@ class ProposalWeights:
 
 
 def make_proposal_weights(weights: CostWeights, *, upright: bool = False) -> ProposalWeights:
-    """Weights of the least squares that match those of the cost.
+    """Residual weights that match the weights of the cost, relative to that of the position.
 
     Args:
         weights: Weights of the cost.
-        upright: Whether hands are kept level. Their goals are level then, and the weight of the
-            constraint adds to that of their tilt.
+        upright: Whether hands are kept level. Their goals are level then, so the weight of the
+            constraint adds to that of the tilt.
     """
     turn = math.sqrt(weights.orientation / weights.position)
     tilted = weights.orientation * weights.tilt_share + (weights.upright if upright else 0.0)
@@ -84,27 +88,27 @@ def make_proposal_weights(weights: CostWeights, *, upright: bool = False) -> Pro
 
 
 class KinematicProposal:
-    r"""Solves the least squares of the command that brings the tracked frames to their goals.
+    r"""Nonlinear least squares for the command that brings the tracked frames to their goals.
 
     .. math::
 
         \min_a \sum_f \|e_f(\phi_\tau(q, a))\|_W^2 + \|\rho (a - a_0)/s\|^2
         + \|\delta (a - a_{exec})/s\|^2
 
-    φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` a natural
-    command, neutral by default, s half the range of each entry and ρ its effort; δ, the weight of
-    a change, damps what near a singularity would take large motions for little. A few
-    Levenberg-Marquardt steps within the bounds, each a small quadratic program solved by DAQP;
-    the Jacobian is :math:`J_{site}(\phi)\,\partial\phi/\partial a`, by MuJoCo.
+    φ is the `CommandModel`, e the pose error of each tracked frame, :math:`a_0` the natural
+    command (neutral by default), s half the range of each entry and ρ its effort; δ, the weight of
+    a change, damps large motions of little effect near singularities. Solved by a few
+    Levenberg-Marquardt steps within the bounds, each a small quadratic program for DAQP. The
+    Jacobian is :math:`J_{site}(\phi)\,\partial\phi/\partial a`, by MuJoCo.
 
     Args:
         model: The robot's model.
-        command_model: What a command does.
+        command_model: First-order model of the effect of a command.
         sites: Site of each tracked frame.
-        weights: Weights of the errors.
-        support: Area over which the centre of mass stays, None for a robot that balances itself.
-        base_body: The robot's root body, whose centre of mass `support` is about.
-        load: What joints bear of the weight above them, None where that does not count.
+        weights: Weights of the residuals.
+        support: Support area for the centre of mass; None for a robot that balances itself.
+        base_body: The robot's root body, for the centre of mass.
+        load: Static loads of the joints; None if they are not limited.
         iterations: Largest number of linearisations.
     """
 
@@ -146,25 +150,25 @@ class KinematicProposal:
         bounds: tuple[np.ndarray, np.ndarray] | None = None,
         iterations: int | None = None,
     ) -> Solution:
-        """Compute the proposed command, and what it costs.
+        """Compute the proposed command and its cost.
 
         Args:
-            begin: Where the robot is.
-            goals: Pose wanted after `dt` for each tracked frame. Shapes (7,).
+            begin: Initial state.
+            goals: Desired pose of each tracked frame after `dt`. Shapes (7,).
             mode: Mode of the robot; entries without effect in it stay neutral.
-            dt: Time to get there [s].
-            start: Where to start the iteration; neutral by default. Shape (k,).
-            facing: Where a base on wheels shall face, as in `Evaluation`. Shape (2,).
-            free: Which entries may move; all that act by default. The others stay at `natural`.
-                Shape (k,), bool.
-            natural: Command from which efforts count; neutral by default. Shape (k,).
-            balance: Where the centre of mass shall rest on the base, from which a lean counts;
-                where it does as the robot stands by default. Shape (2,).
-            bounds: Lower and upper bounds; those of the command by default. Shapes (k,).
-            iterations: Largest number of linearisations; that of the class by default.
+            dt: Time to reach the goals [s].
+            start: Initial guess; `natural` by default. Shape (k,).
+            facing: Desired heading of a wheeled base, as in `Evaluation`. Shape (2,).
+            free: Mask of the entries that may move, the others stay at `natural`; by default all
+                that act. Shape (k,), bool.
+            natural: Command of zero effort; neutral by default. Shape (k,).
+            balance: Desired position of the centre of mass on the base, from which lean counts; by
+                default that of the standing robot. Shape (2,).
+            bounds: Lower and upper bounds; those of the mode by default. Shapes (k,).
+            iterations: Largest number of linearisations; that of the constructor by default.
 
         Returns:
-            Command within the bounds, and its costs; no costs without goals.
+            Command within the bounds, and its cost; zero cost without goals.
         """
         executed = begin.executed
         space = self.command_model.space
@@ -175,16 +179,17 @@ class KinematicProposal:
         if not len(index) or not goals:
             return Solution(command, 0.0, 0.0)
         low, high = bounds or space.bounds(mode)
-        if executed is not None:  # beyond what can be reached in time nothing would change
+        if executed is not None:  # commands beyond the rate limits have no further effect
             reach = space.compute_max_rate(mode, executed) * dt
             low, high = np.maximum(low, executed - reach), np.minimum(high, executed + reach)
         low, high = low[index], high[index]
-        high = np.maximum(low, high)  # an executed command may be out of the bounds
+        high = np.maximum(low, high)  # the executed command may lie outside the bounds
         command[index] = np.clip(command[index], low, high)
         scale, effort = self.scale[index], self.weights.effort * self._effort[index]
         change = self.weights.change if executed is not None else 0.0
         last = command[index] if executed is None else executed[index]
-        none, sense = np.zeros((0, len(index))), np.zeros(len(index), dtype=np.int32)
+        no_rows = np.zeros((0, len(index)))  # DAQP: bounds only, no general constraints
+        sense = np.zeros(len(index), dtype=np.int32)  # all of them inequalities
 
         best, least, missed, damping = command, np.inf, np.inf, _DAMPING
         matrix = gradient = np.zeros(0)
@@ -196,18 +201,20 @@ class KinematicProposal:
             moved = change * (command[index] - last) / scale
             squares = float(residual @ residual)
             cost = squares + float(np.square(effort * share).sum() + moved @ moved)
-            if cost < least:  # a better point: linearise there, trust the step more
+            # Levenberg-Marquardt: less damping after an improvement, much more after a failed
+            # step, which is retried from the best point with its old linearisation.
+            if cost < least:
                 best, least, missed, damping = command, cost, squares, damping / 4
                 scaled = jacobian[:, index] * scale
                 matrix = scaled.T @ scaled + np.diag(np.square(effort) + change**2)
                 gradient = scaled.T @ residual + np.square(effort) * share + change * moved
             elif not np.isfinite(least):
-                return Solution(command, cost, squares)  # not a number: nothing to improve on
+                return Solution(command, cost, squares)  # NaN at the initial guess
             else:
                 damping *= 16
             damped = matrix + damping * np.eye(len(index))
             upper, lower = (high - best[index]) / scale, (low - best[index]) / scale
-            step, _, status, _ = daqp.solve(damped, gradient, none, upper, lower, sense)
+            step, _, status, _ = daqp.solve(damped, gradient, no_rows, upper, lower, sense)
             if status != _DAQP_OPTIMAL or np.abs(step).max() < _CONVERGED:
                 break
             command = best.copy()
@@ -225,7 +232,7 @@ class KinematicProposal:
         facing: np.ndarray | None = None,
         balance: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the weighted errors after `dt` of a command and their derivative by it.
+        """Compute the weighted residuals after `dt` of a command, and their derivative by it.
 
         Args: as for `solve`.
 
@@ -263,12 +270,12 @@ class KinematicProposal:
         residuals: list[np.ndarray],
         jacobians: list[np.ndarray],
     ) -> None:
-        """Centre of mass beyond the support area, and from where it rests on the base."""
+        """Append the residuals of the centre of mass: beyond the support area, and lean."""
         assert self.support is not None
         com, by_joints = self._linearisation.compute_com(self._base)
         yaw = float(quat_yaw(future[3:7]))
         to_base = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-        # The base takes its mass with it: in the base's frame only joints move the centre.
+        # In the base's frame only the joints (columns from 6 on) move the centre of mass.
         place = to_base @ (by_joints[:2, 6:] @ motion[6:])
         excess, by_place = self.support.linearise_excess(future[:7], com[:2])
         residuals.append(self.weights.support * excess)
@@ -286,19 +293,19 @@ class KinematicProposal:
         residuals: list[np.ndarray],
         jacobians: list[np.ndarray],
     ) -> None:
-        """Heading of the base beside where it shall face."""
+        """Append the heading error of the base."""
         lateral = float(compute_lateral(future[:7], facing))
-        # A turn about the vertical by one radian turns the heading by one.
+        # Vertical component of the base's angular velocity in the world: rate of its heading.
         turn = quat_rotate(future[3:7], motion[3:6].T)[:, 2]
         residuals.append(np.array([self.weights.lateral * lateral]))
         jacobians.append(-self.weights.lateral * math.hypot(*facing) * turn[None])
 
 
 def pace(executed: np.ndarray, wanted: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Go from one command towards another as far as no entry moves by more than its `reach`.
+    """Scale the step between two commands so that no entry moves by more than its `reach`.
 
-    All entries then arrive together, and a chain keeps its shape on the way: with each at its
-    own rate, a hand tilts while the torso below it is still moving. Shapes (n,).
+    All entries then arrive together, and the hand keeps its orientation on the way; with every
+    entry at its own rate it would tilt while the torso below it is still moving. Shapes (n,).
     """
     distance = np.abs(wanted - executed)
     share = float(np.min(reach / np.maximum(distance, 1e-12), initial=1.0))

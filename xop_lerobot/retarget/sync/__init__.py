@@ -1,1 +1,1 @@
-"""State synchronisation (Eq. 4): a contact-consistent state of noisy sensors."""
+"""State synchronisation (Eq. 4): a contact-consistent state from noisy sensors."""

@@ -1,4 +1,4 @@
-"""Settings and statuses of the state synchronisation; loads no physics."""
+"""Settings and status codes of the state synchronisation; imports no physics."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class SyncStatus(IntEnum):
     BOUNDED = 1
     """The optimum lies on at least one joint limit."""
     RESTARTED = 2
-    """The measurement had left what was remembered, which was begun anew from it."""
+    """The measurement disagreed with the memory, which was restarted from it."""
     MEASUREMENT = 3
-    """Not solved: the measurement, or the last good state if it is not finite."""
+    """Not solved: the measurement is used, or the last good state if it is not finite."""
 
 
 @dataclass(frozen=True)
 class SyncConfig:
-    """How much each sensor and each contact is trusted, as standard deviations.
+    """Standard deviations of sensors and contacts, and parameters of the estimator.
 
     The sensors' defaults are those of a good lidar odometry and clean encoders (noise preset
     `mild`); only ratios matter.
@@ -33,40 +33,40 @@ class SyncConfig:
         position: Measured position of the base [m].
         heading: Measured heading of the base [rad].
         tilt: Measured roll and pitch of the base [rad].
-        joint: Measured joint angle [rad], a tenth of it in metres on sliding joints.
+        joint: Measured joint angle [rad]; a tenth of it in metres for sliding joints.
         velocity: Measured linear velocity of the base [m/s].
         gyro: Measured angular velocity of the base [rad/s].
-        joint_rate: Measured joint velocity [rad/s], a tenth in m/s on sliding joints.
-        prediction: Velocity of the base that the planner predicts from one tick to the next,
-            beyond what was wrong with the state that it started from [m/s].
+        joint_rate: Measured joint velocity [rad/s]; a tenth of it in m/s for sliding joints.
+        prediction: Base velocity that the planner predicts from one tick to the next, in addition
+            to the error of the state that it started from [m/s].
         contact_height: Height of a contact point over its equilibrium [m].
-        contact_tilt: Tilt of a foot over the ground, or of an axle [rad].
-        stance_position: Remembered place of a standing foot, at best [m].
-        stance_heading: Remembered heading of a standing foot, at best [rad].
+        contact_tilt: Tilt of a foot or an axle relative to the ground [rad].
+        stance_position: Remembered position of a stance foot, at best [m].
+        stance_heading: Remembered heading of a stance foot, at best [rad].
         contact_velocity: Velocity of a point in contact [m/s].
-        contact_rate: Angular velocity of a standing foot, roll and pitch rate on wheels [rad/s].
-        touchdown_s: Time in which a foot that has just touched down comes to rest [s].
-        touchdown_height: Height of a foot that touches down, over its equilibrium [m].
-        touchdown_tilt: Its tilt [rad].
-        touchdown_velocity: Its velocity [m/s].
-        touchdown_rate: Its angular velocity [rad/s].
-        lift_height: Height over the lowest foot at which a foot is off the ground [m].
-        lost_height: Height over or under the ground, as measured, at which no contact counts [m].
-        lost_tilt: Tilt of a foot, or of an axle, at which its contact does not count [rad].
-        memory_s: Time over which the place of a standing foot is averaged, while the velocities
+        contact_rate: Angular velocity of a stance foot; roll and pitch rate on wheels [rad/s].
+        touchdown_s: Time constant with which a foot comes to rest after touch-down [s].
+        touchdown_height: Height of a foot at touch-down over its equilibrium [m].
+        touchdown_tilt: Tilt of a foot at touch-down [rad].
+        touchdown_velocity: Velocity of a foot at touch-down [m/s].
+        touchdown_rate: Angular velocity of a foot at touch-down [rad/s].
+        lift_height: Height over the lowest foot from which a foot is off the ground [m].
+        lost_height: Measured distance from the ground from which a contact is inactive [m].
+        lost_tilt: Tilt of a foot or an axle from which its contact is inactive [rad].
+        memory_s: Time over which the position of a stance foot is averaged, while the velocities
             are as good as configured [s].
-        bias_s: Time in which a bias of the measured velocity is found [s].
-        gate: Disagreement of measurement and memory at which the memory is begun anew, in
-            standard deviations [1].
-        max_gap_s: Time without a measurement after which memory is worthless [s].
-        iterations: Most steps of the SQP.
-        tolerance: Largest entry of a step that is the last one [m, rad]; the SQP converges
-            quadratically, so what is left after it is about its square, 0.02 mm.
-        recursive: Whether anything is remembered from tick to tick; without, each solve sees
-            its own measurement alone (Eq. 4 as the paper has it, but for the stance location).
-        project_velocity: Whether the velocity is projected on the stance constraint.
-        equilibrium: Whether contacts are as deep in the ground as the robot's weight presses
-            them; without, points touch it at z = 0.
+        bias_s: Time constant of the bias observer of the measured velocity [s].
+        gate: Disagreement of measurement and memory at which the memory restarts, in standard
+            deviations [1].
+        max_gap_s: Longest gap between measurements that the memory survives [s].
+        iterations: Largest number of SQP steps.
+        tolerance: Largest entry of a step that ends the SQP [m, rad]; it converges quadratically,
+            so the remaining error is about its square, 0.02 mm.
+        recursive: Whether to keep a memory from tick to tick; without it each solve uses only its
+            own measurement (Eq. 4 as in the paper, except for the stance location).
+        project_velocity: Whether to project the velocity on the stance constraint.
+        equilibrium: Whether contacts rest at the depth to which the robot's weight presses them
+            into the ground; otherwise at z = 0.
     """
 
     position: float = 0.01

@@ -1,4 +1,4 @@
-"""Contacts with the ground: feet or wheels, their equilibrium depth, and since when they stand."""
+"""Ground contacts of feet or wheels: equilibrium depth, active set, and memory of stance feet."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ def make_contacts(
     Args:
         morphology: The robot.
         model: Its planning model, with the floor.
-        equilibrium: Whether heights are those under the robot's weight, else of touching.
+        equilibrium: Whether heights are those under the robot's weight; otherwise those at first
+            touch.
 
     Raises:
-        UnknownName: If a contact point is no site of the model.
+        UnknownName: If a contact point is not a site of the model.
         BadValue: If the points of a group are on different bodies.
     """
     data = mujoco.MjData(model)
@@ -65,7 +66,7 @@ def make_contacts(
 
 
 def compute_height(contact: Contact, data: mujoco.MjData) -> float:
-    """Height of a contact over its equilibrium, kinematics up to date [m]."""
+    """Height of a contact over its equilibrium [m]; needs up-to-date kinematics."""
     body = contact.body
     return float(data.xpos[body, 2] + data.xmat[body, 6:9] @ contact.point - contact.height)
 
@@ -73,17 +74,17 @@ def compute_height(contact: Contact, data: mujoco.MjData) -> float:
 def compute_equilibrium(
     model: mujoco.MjModel, qpos: np.ndarray, iterations: int = 50
 ) -> np.ndarray:
-    r"""Let a robot sink into the ground until that bears its weight, in its posture.
+    r"""Find the static equilibrium of a posture on MuJoCo's soft ground.
 
-    A soft contact at rest presses with :math:`f_i = D_i a^{ref}_i` (MuJoCo's constraint at zero
+    A soft contact at rest exerts :math:`f_i = D_i a^{ref}_i` (MuJoCo's constraint at zero
     acceleration). Newton's method finds the height, roll and pitch of the base at which
-    :math:`(J^\top f)_{z,\phi,\theta}` balances gravity; a posture that has no such pose (the mass
-    is beside the feet) or a model without ground is returned as it is.
+    :math:`(J^\top f)_{z,\phi,\theta}` balances gravity. Without a solution (the centre of mass is
+    outside the feet, or there is no ground) the posture is returned unchanged.
 
     Args:
-        model: Model with the ground, on a free base.
+        model: Model with the ground and a free base.
         qpos: Posture near the ground. Shape (nq,).
-        iterations: Most steps.
+        iterations: Largest number of steps.
 
     Returns:
         The posture in equilibrium. Shape (nq,).
@@ -113,7 +114,7 @@ def compute_equilibrium(
         excess, q = compute_excess(step)
         if np.abs(excess).max() < 1e-6 * weight:
             return q
-        small = 1e-7
+        small = 1e-7  # finite-difference step [m, rad]
         slope = np.array(
             [(compute_excess(step + d)[0] - excess) / small for d in np.eye(3) * small]
         )
@@ -123,12 +124,13 @@ def compute_equilibrium(
             break  # nothing touches the ground
         if not np.isfinite(change).all():
             break
+        # At most 0.5 mm or mrad per step: contact forces are not smooth where contacts begin.
         step = step + change * min(1.0, 5e-4 / max(np.abs(change).max(), 1e-12))
     return qpos.copy()
 
 
 def _find_gap(model: mujoco.MjModel, qpos: np.ndarray) -> float:
-    """How far a robot must be lowered to touch the ground, at most 2 cm, to 0.1 mm [m]."""
+    """Height of a robot over the ground, up to 2 cm, with a resolution of 0.1 mm [m]."""
     data = mujoco.MjData(model)
     for gap in np.arange(0, 0.02, 1e-4):
         data.qpos[:] = qpos
@@ -140,37 +142,37 @@ def _find_gap(model: mujoco.MjModel, qpos: np.ndarray) -> float:
 
 
 def _compute_depth(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Mean depth to which the contacts of this pose have sunk [m]."""
+    """Mean penetration depth of the contacts [m]."""
     mujoco.mj_fwdPosition(model, data)
     depths = [-contact.dist for contact in data.contact[: data.ncon]]
     return float(np.mean(depths)) if depths else 0.0
 
 
-_RECENT = 0.2  # share of the newest tick in the recent mean of where a foot is seen
+_RECENT = 0.2  # share of the newest tick in the recent mean of a foot's measured position
 
 
 class StanceMemory:
-    r"""The active set C of Eq. 4 and the known stance locations :math:`p^{world}_{c,i}`.
+    r"""Active set C of Eq. 4, and memory of the stance locations :math:`p^{world}_{c,i}`.
 
-    C holds all wheels; both feet while stationary; the lower foot while mobile. A foot that is
-    lifted, and any contact that is tilted or far from the ground (the robot fell or was lifted),
-    does not count.
+    C holds all wheels; in stationary mode both feet, in mobile mode the lower foot. Lifted feet,
+    and contacts that are tilted or far from the ground (the robot fell or was lifted), are not in
+    it.
 
-    The place of a foot is the mean of where the filtered measurement has seen it since it came
-    to stand, forgetting with the memory's time:
+    The remembered position of a foot is the mean of its filtered measurements since touch-down,
+    with a limited memory:
 
     .. math::
 
         \hat p \leftarrow \hat p + \frac{\Delta t}{\min(T, T_{mem})} (p_c(\tilde x) - \hat p),
         \qquad \sigma^2 = \sigma_{best}^2 + \sigma_p^2\,\frac{\Delta t}{T}
 
-    with T the time it stands. A foot that slips or lifts begins anew; one that creeps is followed
-    within the memory. A foot that has just touched down is not at rest yet: `get_landing` decays
-    from 1 with `touchdown_s`, and loosens its residuals.
+    with T the time since it stands. A foot that slips or lifts restarts; slow creep is followed
+    within the memory time. A foot that has just touched down is not yet at rest: `get_landing`
+    decays from 1 with `touchdown_s` and loosens its residuals.
 
     Args:
         contacts: The robot's feet or wheels.
-        kind: What they are; only those that step are remembered.
+        kind: Kind of the contacts; only feet have a touch-down.
         config: Times and tolerances.
     """
 
@@ -179,33 +181,33 @@ class StanceMemory:
         self.places = np.zeros((len(self.contacts), 3))
         """x, y [m] and heading [rad] of every foot in the world. Shape (contacts, 3)."""
         self.active: tuple[int, ...] = ()
-        """Contacts that count now."""
+        """Indices of the active contacts."""
         self.reset()
 
     def reset(self) -> None:
-        """Forget where anything stands; what stands now has not just landed."""
+        """Forget all stance locations; contacts that are active next count as long at rest."""
         self.active = ()
-        self._stood = [0.0] * len(self.contacts)  # time in the mean [s]
-        self._landed = [math.inf] * len(self.contacts)  # time since the touch-down [s]
-        self._departure = np.zeros((len(self.contacts), 3))  # recent mean, from the place
+        self._stood = [0.0] * len(self.contacts)  # time covered by the mean [s]
+        self._landed = [math.inf] * len(self.contacts)  # time since touch-down [s]
+        self._departure = np.zeros((len(self.contacts), 3))  # recent mean less remembered place
         self._spread = [(math.inf, math.inf)] * len(self.contacts)
         self._is_new = True
 
     def release(self, index: int) -> None:
-        """Forget where a contact stood, because it moves."""
+        """Forget the location of a contact that moves."""
         self._stood[index], self._landed[index] = 0.0, 0.0
 
     def get_landing(self, index: int) -> float:
-        """How much of its touch-down is left in a contact, 1 at first, then falling to 0."""
+        """Remaining effect of a contact's touch-down, decaying from 1 to 0."""
         if not self.kind.steps:
             return 0.0
         return math.exp(-self._landed[index] / self.config.touchdown_s)
 
     def update_contacts(self, data: mujoco.MjData, mode: Mode, dt: float) -> None:
-        """Find what stands on the ground.
+        """Update the active set.
 
         Args:
-            data: Pose of the robot, kinematics up to date.
+            data: Pose of the robot, with up-to-date kinematics.
             mode: Mode of the robot.
             dt: Time since the last update [s].
         """
@@ -239,14 +241,14 @@ class StanceMemory:
         std: tuple[float, float],
         memory_s: float,
     ) -> None:
-        """Take the feet of the filtered measurement into the mean of their places.
+        """Update the mean locations of the active contacts by the filtered measurement.
 
         Args:
             places: x, y [m] and heading [rad] of every contact. Shape (contacts, 3).
-            dt: Time since the last one [s].
-            noise: Standard deviations of a measured position [m] and heading [rad] of the base.
-            std: Those of the filtered position and heading.
-            memory_s: Longest time over which to average [s].
+            dt: Time since the last update [s].
+            noise: Standard deviations of the measured position [m] and heading [rad] of the base.
+            std: Standard deviations of the filtered position [m] and heading [rad].
+            memory_s: Longest averaging time [s].
         """
         for index in self.active:
             stood = self._stood[index]
@@ -269,7 +271,7 @@ class StanceMemory:
             )
 
     def _has_left(self, index: int, std: tuple[float, float]) -> bool:
-        """Whether a foot has been seen beside its place for several ticks: it crept away."""
+        """Whether a foot has been measured off its remembered location for several ticks."""
         place, heading = self._spread[index]
         moved, turned = self._departure[index, :2], abs(self._departure[index, 2])
         gate = self.config.gate

@@ -1,8 +1,8 @@
-"""Filters of the measured state, before the contacts have their say.
+"""Filters of the measured state, applied before Eq. 4.
 
-`SensorFilter` carries the measured pose by the measured velocity; `ContactVelocity` projects a
-velocity on what the contacts allow; `VelocityBias` observes the slowly changing error of the base's
-velocity against its position.
+`SensorFilter` fuses measured positions and velocities; `ContactVelocity` and `project_velocity`
+impose the stance constraint on velocities; `VelocityBias` observes the bias of the base velocity
+against its position.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from xop_lerobot.morphology.contacts import Contact, ContactKind
 from xop_lerobot.retarget.sync.config import SyncConfig
 
 _GROUPS = (slice(0, 3), slice(3, 5), slice(5, 6), slice(6, None))
-"""Degrees of freedom that one sensor measures: position, tilt, heading, joints."""
+"""Degrees of freedom by sensor: position, tilt, heading, joints."""
 
 _LEARNING = 0.05  # share of the newest sample in a sensor's observed noise
-_NOISE_RANGE = (0.1, 10.0)  # observed noise over the configured one
+_NOISE_RANGE = (0.1, 10.0)  # bounds of the observed noise relative to the configured one (std)
 _LEAST_NOISE, _MOST_NOISE = np.square(_NOISE_RANGE)
-_TRENDS = np.array([[0.3], [0.1]])  # share of the newest sample in the mean disagreements
-_TREND_STD = np.sqrt(_TRENDS / (2 - _TRENDS))  # standard deviation of such a mean of noise
+_TRENDS = np.array([[0.3], [0.1]])  # share of the newest sample in two running mean innovations
+_TREND_STD = np.sqrt(_TRENDS / (2 - _TRENDS))  # standard deviation of such a mean of unit noise
 
 
 class SensorFilter:
-    r"""A Kalman filter per degree of freedom: measured positions over integrated velocities.
+    r"""Scalar Kalman filters of all degrees of freedom: positions over integrated velocities.
 
-    Between two ticks the last estimate is carried on by the velocity, so that fast motion makes
-    no lag; the new measurement corrects it by a gain between 0 and 1:
+    Between two ticks the estimate is propagated by the velocity, so that fast motion causes no
+    lag; the new measurement corrects it with a gain between 0 and 1:
 
     .. math::
 
@@ -38,21 +38,21 @@ class SensorFilter:
         K = \bar P / (\bar P + R)
 
     with R the variance of a measured position, Q that of the velocity. Orientation errors are in
-    the world's axes, so that tilt and heading keep their own sensors.
+    world axes, so that tilt and heading keep their own sensors.
 
-    - R is observed: of white noise, :math:`E (e_k - e_{k-1})^2 \approx 2 R`, whatever offset
-      or drift the sensor has besides. It starts as configured and stays within a tenth and ten
-      times of that (standard deviations).
-    - A pose of the base that repeats to the last bit is the lidar's last one, held: no news of
-      position and heading.
-    - A measurement further away than `gate` standard deviations, or on average over a few ticks
-      further than that average of mere noise would be, begins its sensor anew.
+    - R is estimated: for white noise :math:`E (e_k - e_{k-1})^2 \approx 2 R`, whatever offset or
+      drift the sensor has besides. It starts as configured and stays within a tenth and ten times
+      of that (standard deviations).
+    - A base position that repeats bit by bit is a held lidar sample: it carries no new information
+      on position and heading.
+    - A measurement off by more than `gate` standard deviations, or whose mean innovation over a
+      few ticks is larger than noise explains, restarts the filter of its sensor.
 
     Args:
-        model: Robot on a free base.
-        position_std: Of the measured position along each degree of freedom, the orientation's
-            about world axes [m, rad]. Shape (nv,).
-        gate: See above [1].
+        model: Robot with a free base.
+        position_std: Standard deviation of the measured position along each degree of freedom, of
+            the orientation about world axes [m, rad]. Shape (nv,).
+        gate: Gate in standard deviations, see above [1].
     """
 
     def __init__(self, model: mujoco.MjModel, position_std: np.ndarray, gate: float) -> None:
@@ -60,11 +60,11 @@ class SensorFilter:
         self._configured = np.square(position_std)
         self._gate = gate
         self._qpos, self._held = model.qpos0.copy(), np.full(3, np.nan)
-        # A robot without joints has no encoders.
+        # A robot without joints has no group of encoders.
         starts = [group.start for group in _GROUPS if group.start < model.nv]
         self._starts = np.array(starts)
         self._sizes = np.diff([*starts, model.nv])
-        self._level = np.ones(len(starts))  # observed noise over the configured one, variances
+        self._level = np.ones(len(starts))  # observed over configured variance of each sensor
         self._noise = self._configured.copy()
         self._variance = self._noise
         self._innovation = np.zeros(model.nv)
@@ -72,7 +72,7 @@ class SensorFilter:
         self._is_new = True
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Restart from the next measurement."""
         self._is_new = True
 
     @property
@@ -88,16 +88,16 @@ class SensorFilter:
     def update(
         self, qpos: np.ndarray, qvel: np.ndarray, variance: np.ndarray, dt: float
     ) -> tuple[np.ndarray, bool]:
-        """Take in a measurement.
+        """Predict by the velocity and correct by a measurement.
 
         Args:
             qpos: Measured position. Shape (nq,).
             qvel: Mean velocity since the last update. Shape (nv,).
-            variance: Its variances. Shape (nv,).
-            dt: That time [s].
+            variance: Variances of that velocity. Shape (nv,).
+            dt: Time since the last update [s].
 
         Returns:
-            The estimate (nq,), and whether the base's pose began anew.
+            The estimate (nq,), and whether the base's pose was restarted.
         """
         if self._is_new:
             self._start(qpos)
@@ -112,7 +112,7 @@ class SensorFilter:
         rotation = rotation.reshape(3, 3)
         error[3:6] = rotation @ error[3:6]
         fresh = np.ones(self.model.nv, dtype=bool)
-        if np.array_equal(qpos[:3], self._held):
+        if np.array_equal(qpos[:3], self._held):  # a held lidar sample: no position, no heading
             fresh[:3] = fresh[5] = False
         self._held = qpos[:3].copy()
         lost = self._find_lost(error, predicted, fresh)
@@ -134,7 +134,7 @@ class SensorFilter:
         self._is_new = False
 
     def _observe_noise(self, error: np.ndarray, carried: np.ndarray, fresh: np.ndarray) -> None:
-        """Follow the white noise of each sensor by what differs from one sample to the next."""
+        """Estimate the white noise of each sensor from the differences of its innovations."""
         difference = 0.5 * (np.square(error - self._innovation) - carried) / self._configured
         seen = np.add.reduceat(difference, self._starts) / self._sizes
         useful = np.logical_and.reduceat(fresh, self._starts)
@@ -145,7 +145,7 @@ class SensorFilter:
         self._innovation = np.where(fresh, error, self._innovation)
 
     def _find_lost(self, error: np.ndarray, variance: np.ndarray, fresh: np.ndarray) -> np.ndarray:
-        """Entries that disagree once by too much, or by less for several ticks. Shape (nv,)."""
+        """Mask of entries beyond the gate, at once or on average over a few ticks. (nv,)."""
         ratio = error / np.sqrt(variance + self._noise)
         self._trend += np.where(fresh, _TRENDS * (ratio - self._trend), 0.0)
         lost = np.abs(ratio) > self._gate
@@ -159,13 +159,13 @@ class SensorFilter:
         return lost
 
 
-_LEAST_PIVOT = 1e-15  # of a Cholesky factor
+_LEAST_PIVOT = 1e-15  # smallest pivot of a Cholesky factor of full rank
 
 
 def project_velocity(
     qvel: np.ndarray, variance: np.ndarray, jacobian: np.ndarray, constraint: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Find the likeliest velocity under the soft constraint :math:`J v \approx 0`.
+    r"""Most likely velocity under the soft constraint :math:`J v \approx 0`.
 
     .. math::
 
@@ -173,9 +173,9 @@ def project_velocity(
         \rVert^2_{R^{-1}}
         \quad\Rightarrow\quad v = \tilde v - S J^\top (J S J^\top + R)^{-1} J \tilde v
 
-    with S and R diagonal: the update of a Kalman filter whose measurement is "the contact does
-    not move" (Hartley et al., Contact-aided invariant extended Kalman filtering, RSS 2018, have
-    the same for the base). One linear solve of the size of the constraint.
+    with S and R diagonal: a Kalman update with the measurement "the contact does not move"
+    (Hartley et al., Contact-aided invariant extended Kalman filtering, RSS 2018, use it for the
+    base). One linear solve of the size of the constraint.
 
     Args:
         qvel: Measured velocity ṽ [m/s, rad/s]. Shape (nv,).
@@ -202,7 +202,7 @@ def project_velocity(
 def compute_disagreement(
     qvel: np.ndarray, variance: np.ndarray, jacobian: np.ndarray, constraint: np.ndarray
 ) -> float:
-    r"""How badly a measured velocity fits a contact: 1 on average if it holds.
+    r"""Normalised innovation squared of a contact constraint: 1 on average if the contact holds.
 
     .. math:: \tfrac1m (J \tilde v)^\top (J S J^\top + R)^{-1} J \tilde v
 
@@ -215,11 +215,11 @@ def compute_disagreement(
 
 
 def solve_positive(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Solve a small positive definite system by MuJoCo's Cholesky, in a third of NumPy's time.
+    """Solve a small positive definite system by MuJoCo's Cholesky, three times as fast as NumPy.
 
     Args:
-        matrix: Is overwritten. Shape (n, n).
-        vector: Shape (n,).
+        matrix: System matrix; overwritten. Shape (n, n).
+        vector: Right-hand side. Shape (n,).
 
     Raises:
         numpy.linalg.LinAlgError: If the matrix is not positive definite.
@@ -232,15 +232,15 @@ def solve_positive(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 class ContactVelocity:
-    """Jacobian of the velocities that are zero while the contacts hold.
+    """Jacobians and variances of the velocities that are zero while contacts hold.
 
-    Those of each contact are what `Feet` and `Wheels` say, m rows. On wheels also roll and pitch
-    rate of the base, 2 rows, since all wheels stay down.
+    `Feet` and `Wheels` select the m rows of each contact. On wheels the roll and pitch rate of the
+    base are zero, too (2 rows), since all wheels stay on the ground.
 
     Args:
-        model: Robot on a free base.
+        model: Robot with a free base.
         contacts: Its feet or wheels.
-        kind: What they are.
+        kind: Kind of the contacts.
         config: Standard deviations.
     """
 
@@ -256,12 +256,12 @@ class ContactVelocity:
         self._base = int(model.jnt_bodyid[0])
 
     def compute_jacobian(self, data: mujoco.MjData, index: int) -> np.ndarray:
-        """Compute J of one contact, kinematics up to date. Shape (m, nv)."""
+        """Compute J of one contact from up-to-date kinematics. Shape (m, nv)."""
         contact = self.contacts[index]
         rotation = data.xmat[contact.body].reshape(3, 3)
         point = data.xpos[contact.body] + rotation @ contact.point
         if contact.rolls:
-            point[2] -= contact.radius
+            point[2] -= contact.radius  # the material point that touches the ground is at rest
         jacobian = np.empty((6, self.model.nv))
         mujoco.mj_jac(self.model, data, jacobian[:3], jacobian[3:], point, contact.body)
         return self.kind.select_velocities(contact, rotation, jacobian)
@@ -270,8 +270,8 @@ class ContactVelocity:
         """Variance of each row of J v of one contact.
 
         Args:
-            index: Which contact.
-            landing: How much of a touch-down is left in it, 0 to 1.
+            index: Index of the contact.
+            landing: Remaining effect of its touch-down, 0 to 1.
 
         Returns:
             Shape (m,).
@@ -288,14 +288,14 @@ class ContactVelocity:
         return jacobian[:2]
 
 
-_LIMIT = 0.5  # no estimator of a velocity is worse [m/s]
-_JUMP = 0.3  # distance at which the position has jumped rather than drifted [m]
+_LIMIT = 0.5  # largest plausible bias of a velocity estimator [m/s]
+_JUMP = 0.3  # distance from which the position has jumped rather than drifted [m]
 
 
 class VelocityBias:
-    r"""Finds the bias b by which the measured velocity departs from the measured position.
+    r"""Observes the bias b of the measured base velocity against the measured position.
 
-    A critically damped observer of second order, time constant T:
+    A critically damped second-order observer with the time constant T:
 
     .. math::
 
@@ -303,8 +303,8 @@ class VelocityBias:
         \hat p \leftarrow \hat p + \tfrac{2\Delta t}{T} e,\quad
         b \leftarrow b - \tfrac{\Delta t}{T^2} e
 
-    Slow on purpose: white noise of 1 cm at 25 Hz leaves less than 1 mm/s in b, and a delayed
-    position little more when the robot speeds up.
+    T is large on purpose: white noise of 1 cm at 25 Hz leaves less than 1 mm/s in b, and a delayed
+    position little more during acceleration.
 
     Args:
         time_constant: T [s].
@@ -324,7 +324,7 @@ class VelocityBias:
         self._age = 0.0
 
     def update(self, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
-        """Take in a measurement, and return the velocity without its bias.
+        """Update the bias by a measurement, and return the velocity without it.
 
         Args:
             position: Measured position of the base [m]. Shape (3,).
@@ -339,7 +339,7 @@ class VelocityBias:
             return velocity - self.bias
         self._position = self._position + (velocity - self.bias) * dt
         self._age += dt
-        if not np.array_equal(position, self._held):  # else the last sample, held
+        if not np.array_equal(position, self._held):  # else a held sample
             error = position - self._position
             self._held = position.copy()
             if float(error @ error) > _JUMP**2:

@@ -1,4 +1,8 @@
-"""State synchronisation: the simulator's state that the measurements and the contacts agree on."""
+"""State synchronisation: estimate a simulator state consistent with sensors and ground contacts.
+
+`StateSync.synchronise` is called once a tick with the measured state, and returns the state that
+the planner's simulation starts from.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +31,15 @@ from xop_lerobot.retarget.sync.task import SyncTask
 
 logger = logging.getLogger(__name__)
 
-_DAMPING = 1e-9
-_LANDED = 0.01  # of a touch-down is left in a foot that holds [1]
-_LEARNING = 0.05  # step of the logarithm of the observed noise of the velocities per tick [1]
-_MAX_NOISE = 100.0  # observed noise of the velocities over the configured one, variances [1]
+_DAMPING = 1e-9  # regularisation of the SQP's Hessian
+_LANDED = 0.01  # remaining effect of touch-down below which a foot counts as at rest [1]
+_LEARNING = 0.05  # change of the logarithm of the observed velocity noise per tick [1]
+_MAX_NOISE = 100.0  # largest observed variance of the velocities over the configured one [1]
 _CURVATURE = (0.3, 1.0, 2.0)
-"""Error of the mean of two velocities, over their difference: of the base's linear velocity, which
-changes slowly; of its tilt and the joints, which go to and fro between two ticks when a robot
-walks; of its heading, whose lidar is then better than integrating [1]."""
-_BOUND_SLACK = 1e-9  # how far beyond a joint limit a step may end [rad]
+"""Error of the mean of two velocities relative to their difference: for the base's linear velocity,
+which changes slowly; for its tilt and the joints, which oscillate between two ticks of a gait; and
+for its heading, where the lidar is then better than integration [1]."""
+_BOUND_SLACK = 1e-9  # tolerance of the joint limits [rad]
 
 
 @dataclass(frozen=True)
@@ -45,12 +49,12 @@ class Synced:
     Attributes:
         qpos: Generalised position, MuJoCo order; read-only. Shape (nq,).
         qvel: Generalised velocity, MuJoCo order; read-only. Shape (nv,).
-        residual: Root mean square, over the active contacts, of the height over their equilibrium
-            that is left [m]; 0 without one.
+        residual: Root mean square of the remaining heights of the active contacts over their
+            equilibrium [m]; 0 without a contact.
         status: How the solve ended.
         iterations: Steps of the SQP.
-        correction: How far the base was moved from its measurement [m].
-        rotation: How far the base was turned from its measurement [rad].
+        correction: Distance of the base from its measurement [m].
+        rotation: Angle of the base from its measurement [rad].
     """
 
     qpos: np.ndarray
@@ -63,28 +67,28 @@ class Synced:
 
     @property
     def health(self) -> dict[str, float]:
-        """Figures for a recording, by name."""
+        """Health metrics for a recording, by name."""
         return {"sync_residual": self.residual, "sync_status": float(self.status)}
 
 
 class StateSync:
-    r"""Solves Eq. 4 each tick: the state the planner's simulator starts from.
+    r"""Solves Eq. 4 once per tick for the initial state of the planner's simulation.
 
-    1. The memory is carried to the present: the last state by its velocity.
-    2. Which contacts count (`StanceMemory`), and the velocity that they allow
-       (`velocity_projection`), of the measured one and the one that was predicted.
-    3. The measurement, averaged with what was carried over (`SensorFilter`); the height also
-       with what the contacts told of it before, as while a foot touches down they tell little.
-    4. Eq. 4 by SQP (`SyncTask`), each step by mink and DAQP within the joint limits.
+    1. Predict the last state by its velocity.
+    2. Find the active contacts (`StanceMemory`), and project the measured velocity, blended with
+       the one that the plan predicted, on their constraints (`project_velocity`).
+    3. Fuse measurement and prediction (`SensorFilter`). The height also keeps the information of
+       earlier contacts, since a foot during touch-down gives little.
+    4. Solve Eq. 4 by SQP (`SyncTask`), each step by mink and DAQP within the joint limits.
 
     Args:
         morphology: The robot.
         model: Its planning model.
-        config: How much each sensor and contact is trusted.
+        config: Standard deviations of sensors and contacts.
 
     Attributes:
         failures: Number of ticks that fell back to the measurement since the last `reset`.
-        num_qps: Number of steps for which DAQP was asked since the last `reset`.
+        num_qps: Number of steps that needed DAQP since the last `reset`.
     """
 
     def __init__(
@@ -119,7 +123,7 @@ class StateSync:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past: the robot may be anywhere now."""
+        """Discard all memory: the robot may have been moved."""
         self.failures = self.num_qps = 0
         self._last: Synced | None = None
         self._seen = (np.zeros(0), np.zeros(0))
@@ -128,7 +132,7 @@ class StateSync:
 
     @property
     def time(self) -> float:
-        """When the last state was measured [s]; minus infinity before the first."""
+        """Time of the last measurement [s]; minus infinity before the first."""
         return self._last_time
 
     def _forget(self) -> None:
@@ -148,20 +152,20 @@ class StateSync:
         mode: Mode,
         expected: np.ndarray | None = None,
     ) -> Synced:
-        """Find the state that measurement, contacts and memory agree on; never raises.
+        """Estimate the state from measurement, contacts and memory; never raises.
 
         Args:
-            time: Clock of the robot [s].
+            time: The robot's clock [s].
             qpos: Measured generalised position. Shape (nq,).
             qvel: Measured generalised velocity. Shape (nv,).
-            mode: Mode the robot is in: which contacts count.
-            expected: Linear velocity of the base that the planner predicted for `time` when it
-                started from the last state, world axes [m/s]; None for none. Shape (3,).
+            mode: Mode of the robot, which decides on the active contacts.
+            expected: Linear velocity of the base at `time` as the planner predicted it from the
+                last state, world axes [m/s]; None without a prediction. Shape (3,).
 
         Returns:
-            The state; the measurement with status `MEASUREMENT` where there is no solution, and
-            the last good state where the measurement is not finite. The same measurement of the
-            same time once more gives the same state.
+            The state. If the solve fails, the measurement with status `MEASUREMENT`; if the
+            measurement is not finite, the last good state. Repeating a measurement with the same
+            time returns the same state again.
         """
         try:
             if not (np.isfinite(qpos).all() and np.isfinite(qvel).all() and np.isfinite(time)):
@@ -171,7 +175,7 @@ class StateSync:
                 return self._last
             self._last = self._solve(float(time), qpos, qvel, mode, expected)
             self._seen = (qpos.copy(), qvel.copy())
-        except Exception as error:  # whatever it is, the control loop goes on
+        except Exception as error:  # a control loop must not die of a failed estimate
             if not self.failures:
                 logger.warning("state synchronisation failed: %r; the measurement is used", error)
             self._forget()
@@ -179,7 +183,7 @@ class StateSync:
         return self._last
 
     def _is_seen(self, time: float, qpos: np.ndarray, qvel: np.ndarray) -> bool:
-        """Whether this is the last measurement again: a look at a robot that did not move on."""
+        """Whether this repeats the last measurement: the robot was read twice in one tick."""
         same = zip((qpos, qvel), self._seen, strict=True)
         return time == self._last_time and all(np.array_equal(*pair) for pair in same)
 
@@ -223,7 +227,7 @@ class StateSync:
             carried = variance + np.square(self._curvature) * np.maximum(change, 0)
         measured, restarted = self._filter.update(qpos, mean, carried, dt)
         configuration.update(measured)
-        if restarted:  # the guess was wrong, and with it all that came of it
+        if restarted:  # the prediction was wrong, and with it contacts and projected velocity
             self.stance.reset()
             self.stance.update_contacts(configuration.data, mode, 0.0)
             velocity, _ = self._project(qvel)
@@ -234,10 +238,10 @@ class StateSync:
             dt,
             self._filter.base_noise,
             (std[0], std[5]),
-            # The noisier velocities are, the less they tell of feet that creep.
+            # The noisier the velocities, the less they reveal creeping feet: shorten the memory.
             self.config.memory_s / math.sqrt(self._noise),
         )
-        if last is not None:
+        if last is not None:  # scalar Kalman update of the height with the last solution
             height = last.qpos[2] + mean[2] * dt
             variance = std[2] ** 2
             share = variance / (variance + self._height_variance + carried[2] * dt * dt)
@@ -266,11 +270,11 @@ class StateSync:
     def _project(
         self, qvel: np.ndarray, expected: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Project the velocity on the contacts that hold.
+        """Project the velocity on the constraints of the active contacts.
 
         Args:
             qvel: Measured velocity. Shape (nv,).
-            expected: Predicted linear velocity of the base, None for none. Shape (3,).
+            expected: Predicted linear velocity of the base; None without one. Shape (3,).
 
         Returns:
             Velocity and its variances. Shapes (nv,), (nv,).
@@ -291,9 +295,9 @@ class StateSync:
             if landing < _LANDED:
                 disagreements.append(disagreement)
             excess = disagreement / self.config.gate - 1
-            if excess > 1:  # it slips or swings
+            if excess > 1:  # the foot slips or swings
                 stance.release(index)
-            if excess > 0:  # the less it fits, the less it counts
+            if excess > 0:  # inflate its variance in proportion to the disagreement
                 own = np.square(jacobian) @ variance
                 allowed = allowed + excess * (own + allowed)
             jacobians.append(jacobian)
@@ -314,9 +318,9 @@ class StateSync:
     def _blend(
         self, qvel: np.ndarray, variance: np.ndarray, expected: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Average the base's measured linear velocity with the predicted one, as a Kalman filter.
+        """Fuse the measured linear velocity of the base with the predicted one (Kalman update).
 
-        A robot that is pushed moves as nobody predicted: what disagrees by too much is no news.
+        A prediction beyond the gate is ignored: a pushed robot does not move as planned.
 
         Returns:
             Velocity and its variances. Shapes (nv,), (nv,).
@@ -332,18 +336,18 @@ class StateSync:
         return qvel, variance
 
     def _observe_noise(self, disagreement: float) -> None:
-        """Follow the noise of the velocities: the median of `disagreement` shall be 1.
+        """Adapt the noise of the velocities so that the median of `disagreement` is 1.
 
-        The median, since a foot that slips or swings disagrees by far more than noise can.
+        The median is robust to slipping or swinging feet, which disagree far more than noise.
         """
         self._noise *= math.exp(math.copysign(_LEARNING, disagreement - 1))
         self._noise = min(max(self._noise, 1.0), _MAX_NOISE)
 
     def _descend(self) -> tuple[int, bool]:
-        """SQP from where the configuration is.
+        """Run the SQP from the present configuration.
 
         Returns:
-            Steps taken, and whether a joint limit held the last one.
+            Number of steps, and whether a joint limit was active in the last one.
         """
         bounded, iterations = False, 0
         while iterations < self.config.iterations:
@@ -357,8 +361,8 @@ class StateSync:
     def _compute_step(self) -> tuple[np.ndarray, bool]:
         r"""One step of the SQP: :math:`\min_d \frac12 d^\top H d + c^\top d` within limits.
 
-        H is positive definite; if the minimum without limits lies within them, it is the
-        minimum with them, and DAQP is not asked.
+        H is positive definite, so an unconstrained minimum within the limits is the solution, and
+        DAQP is only called if it lies outside.
         """
         jacobian, error, _ = self.task.compute_qp_residual(self._configuration)
         hessian = jacobian.T @ jacobian

@@ -1,4 +1,4 @@
-"""The residuals of the state synchronisation, as one task for mink."""
+"""Residuals of the state synchronisation (Eq. 4), as a single mink task."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class SyncTask(mink.Task):
 
     Steps are in the tangent space of MuJoCo's free joint: linear in the world, angular in the body.
 
-    One task instead of mink's stock ones: rows that never change are filled once, and one pass
-    over the contacts gives residual and Jacobian.
+    A single task instead of several of mink's is faster: constant rows are filled once, and one
+    pass over the contacts gives both residual and Jacobian.
 
     Args:
-        model: Robot on a free base.
+        model: Robot with a free base.
         contacts: Its feet or wheels.
-        kind: What they are.
-        config: Standard deviations; the task's cost is one over them.
+        kind: Kind of the contacts.
+        config: Standard deviations, whose inverses are the task's costs.
     """
 
     def __init__(
@@ -63,19 +63,19 @@ class SyncTask(mink.Task):
         self._stance = np.zeros((len(self.contacts), 3))
         slides = model.jnt_type[model.dof_jntid[6:]] == mujoco.mjtJoint.mjJNT_SLIDE
         self.joint_scale = np.where(slides, 0.1, 1.0)
-        """Noise of each joint over that of a hinge. Shape (nv - 6,)."""
+        """Noise of each joint relative to that of a hinge. Shape (nv - 6,)."""
         own = [*[config.position] * 3, config.tilt, config.tilt, config.heading]
         self._base_cost = np.concatenate([1 / np.array(own), 1 / (config.joint * self.joint_scale)])
         self._own_cost = self._base_cost
         super().__init__(cost=self._base_cost, gain=1.0, lm_damping=0.0)
 
     def set_measurement(self, qpos: np.ndarray, std: np.ndarray | None = None) -> None:
-        """Set what was measured, and how well.
+        """Set the measurement and its accuracy.
 
         Args:
             qpos: Generalised position. Shape (nq,).
-            std: Standard deviation along each degree of freedom, the orientation's in world
-                axes; the configured ones by default. Shape (nv,).
+            std: Standard deviation along each degree of freedom, of the orientation in world
+                axes; as configured by default. Shape (nv,).
         """
         self._measured = qpos
         self._own_cost = self._base_cost if std is None else 1 / std
@@ -83,19 +83,19 @@ class SyncTask(mink.Task):
     def set_active(
         self, active: Sequence[int], std: Sequence[np.ndarray], stance: np.ndarray
     ) -> None:
-        """Set which contacts count, how much, and where they stand.
+        """Set the active contacts, their accuracies and their locations.
 
         Args:
-            active: Indices of contacts.
-            std: Standard deviation of each row of each of them; infinite for none. Shapes
-                (`kind.rows`,).
+            active: Indices of the active contacts.
+            std: Standard deviation of each row of each active contact; infinite to ignore a row.
+                Shapes (`kind.rows`,).
             stance: x, y and heading of every contact. Shape (contacts, 3).
         """
         self._active, self._stance = tuple(active), stance
         self.cost = np.concatenate([self._own_cost, *(1 / one for one in std)])
 
     def compute_error(self, configuration: mink.Configuration) -> np.ndarray:
-        """Compute all residuals, without weights. Shape (rows,)."""
+        """Compute all residuals, unweighted. Shape (rows,)."""
         self._evaluate(configuration.data)
         return self._error[: len(self.cost)].copy()
 
@@ -136,7 +136,8 @@ class SyncTask(mink.Task):
         qpos, measured = data.qpos, self._measured
         mujoco.mj_differentiatePos(self.model, self._difference, 1.0, measured, qpos)
         error[: self._num_own] = self._difference
-        # log(R R~^T) in the world's axes, where tilt and heading are apart, is log(R~^T R) turned.
+        # MuJoCo gives log(R~^T R) in body axes. Rotate it to log(R R~^T) in world axes, in which
+        # tilt and heading are separate components.
         mujoco.mju_quat2Mat(self._rotation, qpos[3:7])
         rotation = self._rotation.reshape(3, 3)
         turn = rotation @ self._difference[3:6]
@@ -169,7 +170,7 @@ def _inverse_left_jacobian(turn: np.ndarray) -> np.ndarray:
     """
     cross = skew(turn)
     angle = float(np.sqrt(turn @ turn))
-    if angle < 1e-4:  # the series' next term is under 1e-12
+    if angle < 1e-4:  # limit of the series; its next term is below 1e-12
         factor = 1 / 12
     else:
         factor = 1 / angle**2 - (1 + np.cos(angle)) / (2 * angle * np.sin(angle))
