@@ -451,7 +451,7 @@ def test_licences_are_told_once(
     made_up: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At first use; loudly where use is restricted."""
-    monkeypatch.setattr(tables, "_said", set())
+    monkeypatch.setattr(tables, "_logged", set())
     caplog.set_level("INFO")
     for _ in range(2):
         load_policy("homie", str(made_up))

@@ -1,1 +1,1 @@
-"""Low-level policies: from a command to motor targets, batched, behind one interface."""
+"""Low-level policies: batched controllers from commands to motor targets, behind one interface."""

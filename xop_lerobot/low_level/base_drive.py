@@ -1,4 +1,4 @@
-"""Low-level controllers of robots on driven wheels, whose torso and arms are on servos."""
+"""Low-level controllers of wheeled robots whose torso and arms are position-controlled servos."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 
 
 class BaseDrive(LowLevelPolicy):
-    """Wheel speeds by the robot's `WheelDrive`; torso, arms and grippers by their targets.
+    """Wheel speeds by the robot's `WheelDrive`; targets of torso, arms and grippers passed through.
 
-    The servos are in the model: a torque proportional to the speed error at the wheels,
-    position control at the joints. Which target goes where is found by name: an actuator takes the
-    command entry of its name, else the arm target of its name, else zero (the head looks straight
-    ahead). Targets are clipped to the actuators' ranges.
+    The servos are in the model: torque proportional to the speed error at the wheels, position
+    control at the joints. Targets are matched by name: an actuator takes the command entry of its
+    name, else the arm target of its name, else zero (the head looks straight ahead). Targets are
+    clipped to the actuators' ranges.
 
     Args:
-        path: Must be None, this controller has no file.
-        morphology: The robot; None for the one of this project that has a policy of this name.
+        path: Must be None, since this controller has no file.
+        morphology: The robot; None for the built-in one that has a policy of this name.
 
     Raises:
         PolicyFileError: If a path is given.
@@ -45,7 +45,7 @@ class BaseDrive(LowLevelPolicy):
         actuators = [model.actuator(i).name for i in range(model.nu)]
         commands, arms = morphology.command_space.names, morphology.arm_names
         self._sizes = model.nq, model.nv, len(commands), len(arms)
-        assert morphology.drive is not None, f"the wheels of {morphology.name} are not known"
+        assert morphology.drive is not None, f"{morphology.name} has no wheel kinematics"
         self._drive = morphology.drive
         self._wheels = [actuators.index(name) for name in self._drive.wheels]
         acts = [effect.acts for effect in morphology.effects]
@@ -58,7 +58,7 @@ class BaseDrive(LowLevelPolicy):
         self._high = np.where(limited, model.actuator_ctrlrange[:, 1], np.inf)
 
     def initial_memory(self, n: int = 1) -> np.ndarray:
-        """Nothing to remember. Shape (n, 0)."""
+        """Empty memory: the controller is stateless. Shape (n, 0)."""
         return np.zeros((n, 0))
 
     def act(
@@ -103,7 +103,7 @@ class MecanumDrive(BaseDrive):
 def _pairs(
     actuators: list[str], wanted: list[str] | tuple[str, ...], source: tuple[str, ...] | None = None
 ) -> tuple[list[int], list[int]]:
-    """Return positions among `actuators` and in `source` of the names that both have."""
+    """Indices in `actuators` and in `source` of the wanted names that are actuators."""
     source = tuple(wanted) if source is None else source
     names = [name for name in wanted if name in actuators]
     return [actuators.index(name) for name in names], [source.index(name) for name in names]

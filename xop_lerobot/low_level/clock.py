@@ -1,4 +1,4 @@
-"""The clock of a gait: phases that go on, stop or begin anew."""
+"""Gait clock of a policy: phases that advance, stop or reset."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from xop_lerobot.low_level.description import Clock
 from xop_lerobot.low_level.policy import POLICY_DT
 
 NEAR = 0.05
-"""How near to where it stops a phase of a clock that ``"stops"`` has to be."""
+"""Tolerance of the phase at which a clock that ``"stops"`` stops and starts [cycles]."""
 
 
 class GaitClock:
-    """Phases of a batch of robots, see `Clock`.
+    """Gait phases of a batch of robots; see `Clock`.
 
     Args:
-        table: What the table says of it.
+        table: Description of the clock.
 
     Attributes:
-        initial: Phases of a robot that has stood so far. Shape (p,).
+        initial: Phases of a robot that has not walked yet. Shape (p,).
 
     Raises:
-        BadValue: If there are not as many phases of standing as of walking, or none of them for
-            a clock that stops.
+        BadValue: If `phases` and `standing_phases` differ in number, or a clock that stops has no
+            `standing_phases`.
     """
 
     def __init__(self, table: Clock) -> None:
@@ -42,14 +42,14 @@ class GaitClock:
             self.initial = self._standing
 
     def step(self, phases: np.ndarray, stands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Let 20 ms pass.
+        """Advance the clock by 20 ms.
 
         Args:
             phases: Phases before. Shape (n, p).
-            stands: Who stands. Shape (n,).
+            stands: Mask of the robots that stand. Shape (n,), bool.
 
         Returns:
-            Phases to show, and those to remember. Shapes (n, p).
+            Phases for the observation, and those to remember. Shapes (n, p).
         """
         table, still = self._table, stands[:, None]
         later = np.remainder(phases + POLICY_DT / table.period, 1.0)

@@ -1,11 +1,11 @@
-r"""What a table says of a low-level policy: networks, what they see, what their outputs move.
+r"""Schema of policy tables: networks, their observations, and the joints that their outputs move.
 
-A table is a TOML file. docs/use/own_policy.md explains every key by an example; the structs below
-are its grammar, and msgspec checks a file against them: an unknown key, a wrong type or a missing
-entry is named with its place.
+A table is a TOML file that describes a low-level policy. docs/use/own_policy.md explains every key
+by an example. msgspec validates files against the structs below and reports unknown keys, wrong
+types and missing entries with their location.
 
 Joints are named by patterns (``"*_knee_joint"``) or by the groups of `joints.GROUPS`; where numbers
-go by joint, the last pattern that fits counts.
+are given by joint, the last matching pattern wins.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from xop_lerobot.core.command import Mode
 
 Positive = Annotated[int, Meta(ge=1)]
 type Numbers = float | tuple[float, ...] | dict[str, float]
-"""One number for all, one for each, or numbers by pattern of joints."""
+"""One number for all, one for each, or numbers by joint pattern."""
 
 
 class _Strict(Struct, frozen=True, forbid_unknown_fields=True):
@@ -29,9 +29,9 @@ class Term(_Strict, frozen=True, tag_field="term"):
     """One term of an observation.
 
     Attributes:
-        scale: Factors of its numbers.
-        remembered: Whether the frames of the past hold it.
-        frames: How many times it is shown: as it was in the frames before, oldest first, and now.
+        scale: Factors on its values.
+        remembered: Whether past frames include it.
+        frames: Number of frames shown: the last `frames` - 1, oldest first, then the present one.
     """
 
     scale: Numbers = 1.0
@@ -63,9 +63,9 @@ class JointPositions(Term, frozen=True, tag="joint_positions"):
     """Angles of joints [rad].
 
     Attributes:
-        joints: Which.
-        relative: Whether they are shown less the default posture.
-        less_command: Joints that are shown less their command instead.
+        joints: Joints to show.
+        relative: Whether angles are relative to the default posture.
+        less_command: Joints whose angles are relative to their command instead.
     """
 
     joints: tuple[str, ...] = ("all",)
@@ -83,8 +83,8 @@ class JointTargets(Term, frozen=True, tag="joint_targets"):
     """Commanded angles of waist and arms [rad].
 
     Attributes:
-        joints: Which.
-        relative: Whether they are shown less the default posture.
+        joints: Joints to show.
+        relative: Whether angles are relative to the default posture.
     """
 
     joints: tuple[str, ...] = ("arms",)
@@ -95,8 +95,8 @@ class Commands(Term, frozen=True, tag="commands", kw_only=True):
     """Entries of the command, in its units.
 
     Attributes:
-        names: Which.
-        gated: Whether they are shown as zero in stationary mode.
+        names: Entries to show.
+        gated: Whether they are zero in stationary mode.
     """
 
     names: tuple[str, ...]
@@ -104,7 +104,7 @@ class Commands(Term, frozen=True, tag="commands", kw_only=True):
 
 
 class Walks(Term, frozen=True, tag="walks"):
-    """The mode: `standing` or `walking`. 1 number."""
+    """The mode as a number, `standing` or `walking`. 1 number."""
 
     standing: float = 0.0
     walking: float = 1.0
@@ -127,7 +127,7 @@ class Cosine(Term, frozen=True, tag="cos"):
 
 
 class Constant(Term, frozen=True, tag="constant", kw_only=True):
-    """Numbers that never change."""
+    """Constant numbers."""
 
     values: tuple[float, ...]
 
@@ -137,13 +137,12 @@ class Reference(Term, frozen=True, tag="reference"):
 
 
 class Past(_Strict, frozen=True, tag_field="term", tag="past"):
-    """Frames of the past: what is remembered of an observation.
+    """Past frames of the observation, of the terms that are remembered.
 
     Attributes:
-        frames: How many; the one of now is not among them.
+        frames: Number of frames, without the present one.
         order: ``"oldest first"`` or ``"newest first"``.
-        by: ``"frame"`` for one frame after the other, ``"term"`` for all of a term, then all of
-            the next.
+        by: ``"frame"`` to group by frame, ``"term"`` to group by term.
     """
 
     frames: Positive
@@ -159,12 +158,12 @@ type Seen = (
 
 
 class File(_Strict, frozen=True):
-    """A file of weights.
+    """A file of network weights.
 
     Attributes:
-        name: Its name, in the cache or beside the table.
-        url: Where it is published, at a pinned revision; None if it can't be downloaded.
-        sha256: Its SHA-256; None where any file is as good.
+        name: File name, in the cache or beside the table.
+        url: Download address at a pinned revision; None if it can't be downloaded.
+        sha256: Expected SHA-256; None to accept any file.
     """
 
     name: str
@@ -177,14 +176,13 @@ class Clock(_Strict, frozen=True):
 
     Attributes:
         period: :math:`T` [s].
-        phases: With which a robot sets off.
-        advance: Whether time passes before a phase is shown, or after.
-        standing: What becomes of the phases of a robot that stands: they go on (``"runs"``), are
-            set back to `phases` (``"resets"``), or go on until one of them is at the first of
+        phases: Initial phases of a robot that starts to walk [cycles].
+        advance: Whether the phase advances before or after it is shown.
+        standing: Behaviour of a standing robot's phases: they advance (``"runs"``), are set to
+            `phases` (``"resets"``), or advance until one of them reaches the first of
             `standing_phases`, and stop there (``"stops"``).
-        standing_phases: What a robot that stands is shown; None for its phases as they are.
-        stance: Share of a cycle in which a foot is on the ground, which is stretched to half of
-            the sine; None for none.
+        standing_phases: Phases shown to a standing robot; None for the phases as they are.
+        stance: Duty factor of a foot, which is mapped to half a cycle; None for no mapping.
     """
 
     period: Annotated[float, Meta(gt=0)]
@@ -196,12 +194,12 @@ class Clock(_Strict, frozen=True):
 
 
 class ReferenceTable(_Strict, frozen=True):
-    """A network that turns terms into numbers which the policy's own network sees.
+    """A network whose outputs are part of the observation of the policy's own network.
 
     Attributes:
         file: Its weights.
-        statistics: File of means and deviations of its input and output.
-        sees: Its input.
+        statistics: File of means and standard deviations of its input and output.
+        sees: Terms of its input.
     """
 
     file: File
@@ -210,17 +208,17 @@ class ReferenceTable(_Strict, frozen=True):
 
 
 class Action(_Strict, frozen=True):
-    r"""What the outputs move: :math:`q^* = q_0 + s\,a`, within the joints' limits.
+    r"""Mapping of outputs to joint targets: :math:`q^* = q_0 + s\,a`, within the joint limits.
 
-    Joints that no output moves follow command and arm targets, else keep the default posture.
+    Joints without an output follow command and arm targets, or else keep the default posture.
 
     Attributes:
         joints: Joints of the outputs, in order.
         scale: :math:`s`.
-        clip: Size to which outputs are clipped; None for no limit.
-        residual: Joints whose output is added to their command, in place of the default posture.
+        clip: Magnitude to which outputs are clipped; None for no limit.
+        residual: Joints whose output is added to their command instead of the default posture.
         discard: Joints whose output is not used.
-        hold: Joints that stay at the default posture whatever is commanded.
+        hold: Joints that stay at the default posture, regardless of the command.
     """
 
     joints: tuple[str, ...]
@@ -232,18 +230,18 @@ class Action(_Strict, frozen=True):
 
 
 class Network(_Strict, frozen=True):
-    """A network: its file, what it sees, what it moves.
+    """A network: its file, observation and actions.
 
     Attributes:
         file: Its weights: ONNX, TorchScript (``.pt``), or ``.npz`` of a multilayer perceptron.
-        sees: The observation, in order.
-        action: What its outputs move.
-        default: Default posture by joint [rad]; 0 where nothing is said.
-        clip_seen: Size to which the observation is clipped; None for no limit.
-        clock: Its gait.
-        reference: A network before it.
-        begins: What its past holds at first: zeros, or the first frame.
-        whole_past: Number of frames, with that of now, of a second input; None without one.
+        sees: Terms of the observation, in order.
+        action: Mapping of its outputs to joint targets.
+        default: Default posture by joint [rad]; 0 for joints that are not named.
+        clip_seen: Magnitude to which the observation is clipped; None for no limit.
+        clock: Its gait clock.
+        reference: A network whose outputs it sees.
+        begins: Initial content of its past frames: zeros, or the first frame.
+        whole_past: Number of frames, including the present one, of a second input; None without.
     """
 
     file: File
@@ -258,12 +256,12 @@ class Network(_Strict, frozen=True):
 
 
 class Motors(_Strict, frozen=True):
-    """Motors that a policy was trained with, by joint; those not named are the model's.
+    """Motor gains that a policy was trained with, by joint; other joints keep the model's.
 
     Attributes:
-        stiffness: [N m/rad].
-        damping: [N m s/rad].
-        torque: Largest torque [N m].
+        stiffness: k_p [N m/rad].
+        damping: k_d [N m s/rad].
+        torque: Torque limit [N m].
     """
 
     stiffness: dict[str, float] = {}
@@ -272,12 +270,12 @@ class Motors(_Strict, frozen=True):
 
 
 class Rest(_Strict, frozen=True):
-    """Where the base of a standing robot comes to rest; see `rest.RestMap`.
+    """Rest pose of the base of a standing robot; see `rest.RestMap`.
 
     Attributes:
-        axes: Two entries of the command and the values at which it was measured.
-        pitch: Pitch of the base [rad], a row for each value of the first entry.
-        forward: Place of the base ahead of the middle of the feet [m], the same.
+        axes: Two entries of the command and their grid values.
+        pitch: Pitch of the base [rad]; one row per value of the first entry.
+        forward: Forward position of the base relative to the middle of the feet [m]; same layout.
     """
 
     axes: dict[str, tuple[float, ...]]
@@ -289,25 +287,25 @@ class PolicyTable(_Strict, frozen=True):
     """A low-level policy as data.
 
     Attributes:
-        title: Its name, as people say it.
+        title: Display name.
         robot: The robot that it fits.
         license: Licence of its weights, an SPDX identifier.
-        source: Where it comes from.
+        source: Origin.
         stationary: What runs in stationary mode: one of `networks`, or another policy.
-        mobile: What runs in mobile mode.
+        mobile: The same for mobile mode.
         networks: Networks by name.
-        terms: What a user has to know of the licence, said at first use; empty for nothing.
-        motors: Motors that it was trained with.
-        arm_limits: Angles within which arm targets are kept, by joint [rad].
-        ranges: What it can do in each mode: entry of the command -> lowest, highest. What is
-            outside is not asked of it; entries that are not named keep the robot's bounds.
-        stands_below: In mobile mode a robot stands as well while all these entries of the command
-            are smaller in size.
-        dead_zones: Size of a velocity under which nothing happens, by entry of the command.
-        stop_rates: How fast velocities may end where the robot is to stand, by entry, in place of
-            the robot's own limits [unit of the entry per second].
-        rest: How the base of a standing robot leans and moves unasked; None where it does not.
-        handover_s: Time in which targets go over from one network's to another's [s].
+        terms: Note on the licence that is logged at first use; empty for none.
+        motors: Motor gains that it was trained with.
+        arm_limits: Limits of the arm targets, by joint [rad].
+        ranges: Command ranges that it can follow, by mode and entry: lowest, highest. Commands are
+            limited to them; entries that are not named keep the robot's bounds.
+        stands_below: In mobile mode a robot also stands while the magnitudes of all these entries
+            are below these values.
+        dead_zones: Magnitude of a velocity below which the policy does not react, by entry.
+        stop_rates: Rate limits of velocities when the robot has to stop, by entry, instead of the
+            robot's own [unit of the entry per second].
+        rest: Lean and displacement of the base of a standing robot; None for none.
+        handover_s: Time over which targets are blended from one network to the other [s].
     """
 
     title: str
@@ -328,5 +326,5 @@ class PolicyTable(_Strict, frozen=True):
     handover_s: float = 0.2
 
     def find_part(self, mode: Mode) -> str:
-        """Name of the network, or of the policy, that runs in `mode`."""
+        """Name of the network or policy that runs in `mode`."""
         return self.stationary if mode is Mode.STATIONARY else self.mobile

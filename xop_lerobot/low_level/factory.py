@@ -1,4 +1,4 @@
-"""Low-level policies by name: tables that ship with the package, tables of one's own, and code."""
+"""Low-level policies by name: built-in tables, a user's own tables, and controllers in code."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ POLICIES: Registry[Callable[..., LowLevelPolicy]] = Registry(
         "mecanum_drive": "xop_lerobot.low_level.base_drive:MecanumDrive",
     },
 )
-"""Factories by name, called as ``factory(path=None)``: the tables that ship with the package, and
-the policies that are code."""
+"""Factories by name, called as ``factory(path=None)``: built-in tables and controllers in code."""
 
 for _name in list_tables():
     POLICIES.add(_name, partial(load_policy, _name))
@@ -32,9 +31,9 @@ def make_policy(name: str, path: str | None = None) -> LowLevelPolicy:
     """Make the low-level policy `name`.
 
     Args:
-        name: A registered name, for example ``"falcon"``, or the path of a table of your own,
-            ``"my_policy.toml"``, or of an ONNX file that describes itself.
-        path: The policy's file, or the folder of its files; None for its own default.
+        name: A registered name such as ``"falcon"``, or the path of a table (``"my_policy.toml"``)
+            or of an ONNX file with metadata.
+        path: The policy's file, or the folder of its files; None for its default.
 
     Raises:
         UnknownName: Listing the known policies.
@@ -46,17 +45,18 @@ def make_policy(name: str, path: str | None = None) -> LowLevelPolicy:
 
 
 def list_policies(morphology: Morphology) -> tuple[str, ...]:
-    """Names of the policies that fit a robot; its own first."""
+    """Names of the policies that fit a robot; its default first."""
     others = [name for name in list_tables() if find_robot(name) == morphology.name]
     return (*morphology.policies, *(name for name in others if name not in morphology.policies))
 
 
 def resolve_policy(morphology: Morphology, name: str = "") -> str:
-    """Return the policy that `name` means for a robot: empty and ``"default"`` are its own.
+    """Resolve a policy name for a robot; empty and ``"default"`` mean the robot's own policy.
 
     Raises:
-        UnknownName: If it does not fit the robot, with those that do.
-        PolicyFileError: If it is the path of a table that is missing or malformed.
+        UnknownName: If the policy does not fit the robot; lists those that do.
+        PolicyFileError: If it is the path of a table that is missing, malformed, or for another
+            robot.
     """
     if is_table(name):
         robot = find_robot(name)

@@ -1,4 +1,4 @@
-"""The joints of a robot as tables of policies name them: by group, by name, by pattern."""
+"""Actuated joints of a robot, selected by group, name or pattern as in policy tables."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from xop_lerobot.core.errors import BadValue
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 
 GROUPS = ("all", "legs", "waist", "arms")
-"""Joints of the robot: all of them, in the model's order; those that neither a command nor an arm
-target names; those that a command names; those of the arms."""
+"""Groups of joints: all, in the model's order; those without a command or arm target; those that
+are command entries; those of the arms."""
 
 
 def as_index(places: Sequence[int] | np.ndarray) -> slice | np.ndarray:
-    """What picks columns: a slice where they follow each other, which costs nothing."""
+    """Index of columns: a slice if they are consecutive, since slicing copies nothing."""
     places = np.asarray(places, dtype=int)
     if len(places) and np.array_equal(places, np.arange(places[0], places[0] + len(places))):
         return slice(int(places[0]), int(places[-1]) + 1)
@@ -31,15 +31,15 @@ class RobotJoints:
 
     Attributes:
         names: Their names.
-        commands: Names of the entries of the command.
-        positions: Where each is in `qpos`. Shape (nu,).
-        velocities: Where each is in `qvel`. Shape (nu,).
+        commands: Names of the command entries.
+        positions: Addresses in `qpos`. Shape (nu,).
+        velocities: Addresses in `qvel`. Shape (nu,).
         low: Lower limits [rad]. Shape (nu,).
         high: Upper limits [rad]. Shape (nu,).
-        stiffness: Of the model's servos [N m/rad]. Shape (nu,).
-        damping: Of the model's servos [N m s/rad]. Shape (nu,).
-        by_command: Joint -> entry of the command that is its angle.
-        by_arm: Joint -> arm target that is its angle.
+        stiffness: Stiffness of the model's servos [N m/rad]. Shape (nu,).
+        damping: Damping of the model's servos [N m s/rad]. Shape (nu,).
+        by_command: Joint -> index of the command entry that is its target.
+        by_arm: Joint -> index of the arm target that is its target.
         nq: Size of `qpos`.
         nv: Size of `qvel`.
         num_arms: Number of arm targets.
@@ -64,7 +64,7 @@ class RobotJoints:
         """Read the joints from a robot's planning model.
 
         Raises:
-            BadValue: If it has motors that turn no joint.
+            BadValue: If it has actuators that are not on a joint.
         """
         import mujoco  # noqa: PLC0415
 
@@ -98,10 +98,10 @@ class RobotJoints:
         )
 
     def select(self, patterns: Sequence[str]) -> list[int]:
-        """Joints that `patterns` name: pattern by pattern, each in the model's order.
+        """Indices of the joints that match `patterns`: by pattern, then in the model's order.
 
         Raises:
-            BadValue: If a pattern fits no joint, or a joint is named twice.
+            BadValue: If a pattern matches no joint, or a joint is named twice.
         """
         found: list[int] = []
         for pattern in patterns:
@@ -118,10 +118,10 @@ class RobotJoints:
         return found
 
     def find_command(self, entry: str) -> int:
-        """Position of an entry of the command.
+        """Index of a command entry.
 
         Raises:
-            BadValue: Listing the entries of the robot.
+            BadValue: If there is no such entry; lists those of the robot.
         """
         if entry not in self.commands:
             raise BadValue(
@@ -130,10 +130,10 @@ class RobotJoints:
         return self.commands.index(entry)
 
     def spread(self, numbers: Mapping[str, float], default: float | np.ndarray) -> np.ndarray:
-        """One number a joint, by patterns of which the last that fits counts. Shape (nu,).
+        """Expand numbers by pattern to one per joint; the last match wins. Shape (nu,).
 
         Raises:
-            BadValue: If a pattern fits no joint.
+            BadValue: If a pattern matches no joint.
         """
         spread = np.full(len(self.names), default, dtype=float)
         for pattern, number in numbers.items():
@@ -146,7 +146,7 @@ class RobotJoints:
         return sorted(self.by_arm, key=lambda joint: self.by_arm[joint])
 
     def is_commanded(self, joint: int) -> bool:
-        """Whether a command or an arm target is the angle of `joint`."""
+        """Whether a command entry or an arm target is the target of `joint`."""
         return joint in self.by_command or joint in self.by_arm
 
     def _fits(self, joint: int, pattern: str) -> bool:
@@ -158,5 +158,5 @@ class RobotJoints:
 
 @cache
 def read_joints(robot: str) -> RobotJoints:
-    """The joints of a robot, by its name."""
+    """Actuated joints of a robot, by its name."""
     return RobotJoints.of(make_morphology(robot))

@@ -1,4 +1,4 @@
-"""The executor of every policy that is a table: one network a mode, batched."""
+"""Batched executor of policy tables: one network per mode, with blended hand-over between them."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MotorSet:
-    """Motors by joint.
+    """Motor gains and limits by joint.
 
     Attributes:
         stiffness: k_p [N m/rad]. Shape (nu,).
         damping: k_d [N m s/rad]. Shape (nu,).
-        torque: Largest torque [N m]; infinite for the model's own. Shape (nu,).
+        torque: Torque limit [N m]; infinite to keep the model's. Shape (nu,).
     """
 
     stiffness: np.ndarray
@@ -38,7 +38,7 @@ class MotorSet:
 
     @classmethod
     def read(cls, table: d.Motors, joints: RobotJoints) -> MotorSet:
-        """The motors of a table; those that it does not name are the model's."""
+        """Read the motors of a table; joints that it does not name keep the model's."""
         return cls(
             joints.spread(table.stiffness, joints.stiffness),
             joints.spread(table.damping, joints.damping),
@@ -46,7 +46,7 @@ class MotorSet:
         )
 
     def matches(self, other: MotorSet) -> bool:
-        """Whether the servos of both do the same."""
+        """Whether both have the same gains."""
         same = np.array_equal(self.stiffness, other.stiffness)
         return same and np.array_equal(self.damping, other.damping)
 
@@ -54,19 +54,19 @@ class MotorSet:
 def convert_targets(
     targets: np.ndarray, q: np.ndarray, v: np.ndarray, of: MotorSet, to: MotorSet
 ) -> np.ndarray:
-    r"""Convert position targets so that other servos give the same torque now.
+    r"""Convert position targets so that servos with other gains give the same torque now.
 
     .. math:: q^*_2 = q + \frac{k_{p1} (q^*_1 - q) - (k_{d1} - k_{d2})\, \dot q}{k_{p2}}
 
     Args:
-        targets: Targets under the servos `of` [rad]. Shape (n, nu).
+        targets: Targets for the servos `of` [rad]. Shape (n, nu).
         q: Angles [rad]. Shape (n, nu).
         v: Velocities [rad/s]. Shape (n, nu).
         of: Servos 1.
         to: Servos 2.
 
     Returns:
-        Targets under the servos `to` [rad]. Shape (n, nu).
+        Targets for the servos `to` [rad]. Shape (n, nu).
     """
     pull = of.stiffness * (targets - q) - (of.damping - to.damping) * v
     return q + pull / to.stiffness
@@ -74,11 +74,11 @@ def convert_targets(
 
 @dataclass(frozen=True)
 class Stage:
-    """A network of a policy, with what its own table says of it.
+    """A network of a policy, with the table that it comes from.
 
     Attributes:
         network: The network.
-        table: The table that it is from.
+        table: Its table.
         motors: The motors that it was trained with.
     """
 
@@ -88,23 +88,23 @@ class Stage:
 
 
 class NetworkPolicy(LowLevelPolicy):
-    r"""Networks that a table describes: one that stands and one that walks, or one for both.
+    r"""Policy of a table: one network for standing and one for walking, or one for both.
 
-    Where there are two, the one that rests watches: it remembers the frames that it would have
-    seen, and outputs that would have given what was executed (its recurrent state begins anew). So
-    it can take over at any time; what its first targets differ from the last ones is taken back
-    within the time of the hand-over, so that targets never step.
+    With two networks, the inactive one shadows the active one: it records the frames that it would
+    have seen, and the outputs that would have given the executed targets (its recurrent state is
+    reset). So it can take over at any time. The difference of its first targets from the last ones
+    decays over the hand-over time, so that targets never step.
 
-    Its memory is that of the network; with two: the mode (-1 before the first step), what is left
-    of the hand-over [s], the difference of targets at its beginning (nu), the last targets (nu),
-    and the memories of both.
+    The memory is that of the network; with two networks: the mode (-1 before the first step), the
+    remaining hand-over time [s], the difference of targets at its beginning (nu), the last targets
+    (nu), and the memories of both.
 
     Args:
-        name: What it is called.
+        name: Name of the policy.
         table: The table.
         joints: The robot's joints.
-        stationary: What stands.
-        mobile: What walks; the same object as `stationary` for one network.
+        stationary: Network for standing.
+        mobile: Network for walking; the same object as `stationary` for a single network.
     """
 
     def __init__(
@@ -142,11 +142,11 @@ class NetworkPolicy(LowLevelPolicy):
 
     @property
     def num_inputs(self) -> int:
-        """Width of what the first network sees."""
+        """Width of the first network's observation."""
         return self._stages[0].network.num_inputs
 
     def adapt(self, model: mujoco.MjModel) -> None:
-        """Give `model` the motors that the policy was trained with; see `LowLevelPolicy`."""
+        """Set the motors of `model` to those that the policy was trained with."""
         for joint, name in enumerate(self._joints.names):
             index = model.actuator(name).id
             model.actuator_gainprm[index, 0] = self.motors.stiffness[joint]
@@ -157,13 +157,13 @@ class NetworkPolicy(LowLevelPolicy):
                 model.actuator_forcerange[index] = -torque, torque
 
     def initial_memory(self, n: int = 1) -> np.ndarray:
-        """Memory of a policy that has not run yet. Shape (n, memory_size)."""
+        """Initial memory. Shape (n, memory_size)."""
         memories = [stage.network.initial_memory(n) for stage in self._stages]
         if len(memories) == 1:
             return memories[0]
-        seam = np.zeros((n, 2 + 2 * len(self._joints.names)))
-        seam[:, 0] = -1
-        return np.concatenate([seam, *memories], axis=1)
+        handover = np.zeros((n, 2 + 2 * len(self._joints.names)))
+        handover[:, 0] = -1
+        return np.concatenate([handover, *memories], axis=1)
 
     def act(
         self,
@@ -188,7 +188,7 @@ class NetworkPolicy(LowLevelPolicy):
         arms = check_batch("arms", arms, n, joints.num_arms)
         memory = check_batch("memory", memory, n, self.memory_size)
         modes = np.broadcast_to(np.asarray(mode, dtype=int), (n,))
-        situation = self._look(qpos, qvel, command, arms, modes)
+        situation = self._gather(qpos, qvel, command, arms, modes)
         if len(self._stages) == 1:
             targets, after = self._run(0, situation, memory)
         else:
@@ -205,16 +205,16 @@ class NetworkPolicy(LowLevelPolicy):
         memory: np.ndarray,
         mode: Mode | np.ndarray,
     ) -> np.ndarray:
-        """What the network of a policy with one network sees; arguments as in `act`.
+        """Observation of a policy with a single network; arguments as in `act`.
 
         Returns:
             Observations, float32. Shape (n, num_inputs).
         """
         modes = np.broadcast_to(np.asarray(mode, dtype=int), (len(qpos),))
-        situation = self._look(qpos, qvel, command, arms, modes)
+        situation = self._gather(qpos, qvel, command, arms, modes)
         return self._stages[0].network.observe(situation, memory)[0]
 
-    def _look(
+    def _gather(
         self,
         qpos: np.ndarray,
         qvel: np.ndarray,
@@ -222,7 +222,7 @@ class NetworkPolicy(LowLevelPolicy):
         arms: np.ndarray,
         modes: np.ndarray,
     ) -> Situation:
-        """What the networks may see."""
+        """Gather the inputs that the networks share."""
         columns = self._columns
         walks = modes == Mode.MOBILE
         stands = ~walks
@@ -249,7 +249,7 @@ class NetworkPolicy(LowLevelPolicy):
     def _run(
         self, index: int, situation: Situation, memory: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Run one network; its targets are for the policy's motors."""
+        """Run one network, and convert its targets to the policy's motors."""
         stage = self._stages[index]
         targets, after = stage.network.act(situation, memory)
         return self._convert(targets, situation, stage.motors, self.motors), after
@@ -263,10 +263,10 @@ class NetworkPolicy(LowLevelPolicy):
         return convert_targets(targets, q, v, of, to)
 
     def _run_both(self, situation: Situation, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Run for each robot the network of its mode, and let the other one watch."""
+        """Run the network of each robot's mode, and let the other one shadow it."""
         nu = len(self._joints.names)
         sizes = [2 + 2 * nu, *(stage.network.memory_size for stage in self._stages)]
-        seam, *memories = np.split(memory, np.cumsum(sizes)[:-1], axis=1)
+        handover, *memories = np.split(memory, np.cumsum(sizes)[:-1], axis=1)
         active = np.where(situation.stands, 0, 1)
         targets = np.empty((len(memory), nu))
         after = [np.empty_like(each) for each in memories]
@@ -275,7 +275,7 @@ class NetworkPolicy(LowLevelPolicy):
             if len(rows):
                 part = situation.choose(rows)
                 targets[rows], after[index][rows] = self._run(index, part, memories[index][rows])
-        targets, seam = self._hand_over(active, targets, seam)
+        targets, handover = self._hand_over(active, targets, handover)
         for index, rows in enumerate(rows_of):
             if len(rows):
                 other = self._stages[1 - index]
@@ -283,17 +283,19 @@ class NetworkPolicy(LowLevelPolicy):
                 theirs = self._convert(targets[rows], part, self.motors, other.motors)
                 watched = other.network.watch(part, memories[1 - index][rows], theirs)
                 after[1 - index][rows] = watched
-        return targets, np.concatenate([seam, *after], axis=1)
+        return targets, np.concatenate([handover, *after], axis=1)
 
     def _hand_over(
-        self, active: np.ndarray, targets: np.ndarray, seam: np.ndarray
+        self, active: np.ndarray, targets: np.ndarray, handover: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Let targets go from one network's to the other's without a step."""
+        """Blend targets from one network to the other without a step."""
         nu = targets.shape[1]
-        later = np.empty_like(seam)
-        before, left = seam[:, 0], seam[:, 1]
+        later = np.empty_like(handover)
+        before, left = handover[:, 0], handover[:, 1]
         changes = (before >= 0) & (before != active) & (self._handover_s > 0)
-        difference = np.where(changes[:, None], seam[:, 2 + nu :] - targets, seam[:, 2 : 2 + nu])
+        difference = np.where(
+            changes[:, None], handover[:, 2 + nu :] - targets, handover[:, 2 : 2 + nu]
+        )
         left = np.where(changes, self._handover_s, np.maximum(left - POLICY_DT, 0.0))
         share = left / self._handover_s if self._handover_s > 0 else left
         targets = targets + share[:, None] * difference
@@ -307,10 +309,10 @@ def _name(mode: Mode) -> Literal["stationary", "mobile"]:
 
 
 def _make_rest(stage: Stage, joints: RobotJoints) -> RestMap | None:
-    """The map of the table of what stands.
+    """Make the rest map of the standing network's table.
 
     Raises:
-        BadValue: If it is malformed, or names what is no entry of the command.
+        BadValue: If it is malformed, or names an unknown command entry.
     """
     rest = stage.table.rest
     if rest is None:
@@ -323,7 +325,7 @@ def _make_rest(stage: Stage, joints: RobotJoints) -> RestMap | None:
 
 
 def _pair(mapping: Mapping[int, int]) -> tuple[slice | np.ndarray, slice | np.ndarray]:
-    """Joints, and where their targets come from."""
+    """Index of joints, and index of their targets."""
     return as_index(list(mapping)), as_index(list(mapping.values()))
 
 
@@ -340,10 +342,10 @@ def check_batch(name: str, array: np.ndarray, n: int, size: int) -> np.ndarray:
 
 
 def _join_limits(joints: RobotJoints, *tables: d.PolicyTable) -> Mapping[str, tuple[float, float]]:
-    """What the arm limits of all tables leave, by joint.
+    """Intersection of the arm limits of all tables, by joint.
 
     Raises:
-        BadValue: If a pattern names a joint that is no arm's.
+        BadValue: If a pattern names a joint that is not an arm joint.
     """
     joined: dict[str, tuple[float, float]] = {}
     for table in tables:

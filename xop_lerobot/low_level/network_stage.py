@@ -1,4 +1,4 @@
-"""One network of a policy, batched: what it sees, what it remembers, what its outputs move."""
+"""One network of a policy, batched: observation, memory, and mapping of outputs to joints."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from xop_lerobot.low_level.terms import FeatureColumns, TermReader, describe, sp
 
 
 class Situation(NamedTuple):
-    """What all networks of a policy may see of a batch.
+    """Inputs of a batch that all networks of a policy share.
 
     Attributes:
         shared: Features that need no memory (`FeatureColumns`). Shape (n, F).
-        stands: Who stands. Shape (n,), bool.
+        stands: Mask of the robots that stand. Shape (n,), bool.
         quat: Orientation of the base, wxyz. Shape (n, 4).
         yaw_rate: Commanded yaw rate [rad/s]. Shape (n,).
     """
@@ -33,28 +33,28 @@ class Situation(NamedTuple):
     yaw_rate: np.ndarray
 
     def choose(self, rows: np.ndarray) -> Situation:
-        """Some rows of the batch."""
+        """Select rows of the batch."""
         return Situation(*(each[rows] for each in self))
 
 
 class NetworkStage:
     """One network with its memory; a pure function of a batch.
 
-    The memory holds the last outputs, the clock's phases, the wanted heading and whether the
-    robot stood, the recurrent state, whether a frame was seen, and the frames of the past, oldest
-    first: each only where the table needs it, but for the outputs.
+    The memory holds the last outputs and, if the table needs them: the clock's phases, the desired
+    heading and whether the robot stood, the recurrent state, whether a frame was seen, and the
+    past frames, oldest first.
 
     Args:
-        table: What the table says of it.
+        table: Description of the network.
         joints: The robot's joints.
         network: Its weights.
-        reference: The network before it, where the table names one.
+        reference: The reference network, if the table has one.
 
     Attributes:
-        memory_size: Numbers that it remembers.
+        memory_size: Size of the memory.
         num_inputs: Width of the observation.
-        sees_velocity: Whether it sees how fast the base moves.
-        held: Joints that stay at the default posture whatever is commanded.
+        sees_velocity: Whether the observation includes the linear velocity of the base.
+        held: Joints that stay at the default posture, regardless of the command.
 
     Raises:
         BadValue: If the table does not fit the robot, or the network the table.
@@ -91,7 +91,7 @@ class NetworkStage:
                 )
         self._lay_out_memory(num_phases, begins=table.begins == "first frame")
 
-    # ------------------------------------------------------------ what the table says
+    # ------------------------------------------------------------ set-up from the table
 
     def _read_action(self, action: d.Action) -> None:
         joints, outputs = self._joints, self._joints.select(action.joints)
@@ -117,13 +117,13 @@ class NetworkStage:
         self._resting, self._postures = as_index(resting), self._default[resting]
 
     def _read_observation(self, table: d.Network, reader: TermReader) -> None:
-        """Decide where each number of now, and of the past, is in the observation."""
+        """Find the position of each present and past value in the observation."""
         now = [term for term in table.sees if not isinstance(term, d.Past)]
         self._terms = reader.read(now)
         starts = np.concatenate([[0], np.cumsum(self._terms.widths)]).astype(int)
         spans = [range(*pair) for pair in zip(starts[:-1], starts[1:], strict=True)]
-        kept: list[int] = []  # what is remembered of a frame
-        places = []  # where each term is in what is remembered
+        kept: list[int] = []  # columns of a frame that are remembered
+        places = []  # columns of each term in the remembered part
         for term, span in zip(now, spans, strict=True):
             places.append(range(len(kept), len(kept) + len(span) * term.remembered))
             kept += span if term.remembered else ()
@@ -133,7 +133,7 @@ class NetworkStage:
         shown = [term.frames - (not isinstance(term, d.Past)) for term in table.sees]
         self._num_frames = max([self._whole - 1, 0, *shown])
         self._past_size, self._now_size = self._num_frames * len(kept), int(starts[-1])
-        order: list[int] = []  # in a row of the buffer, which is the past, then now
+        order: list[int] = []  # columns of the buffer, which is the past, then the present frame
         sizes, left = [], zip(now, spans, places, strict=True)
         for each in table.sees:
             if isinstance(each, d.Past):
@@ -157,7 +157,7 @@ class NetworkStage:
         self._order = None if in_order else np.array(order, dtype=int)
 
     def _find_past(self, count: int, groups: Sequence[range], *, newest: bool) -> list[int]:
-        """Columns of the last `count` frames of the past, group by group of what is kept."""
+        """Columns of the last `count` past frames, by groups of remembered columns."""
         frames = list(range(self._num_frames - count, self._num_frames))  # oldest first
         if newest:
             frames.reverse()
@@ -168,7 +168,7 @@ class NetworkStage:
         sizes = {
             "actions": len(self._outputs),
             "phases": num_phases,
-            "heading": 2 if self._sees_heading else 0,  # the wanted one; whether it stood
+            "heading": 2 if self._sees_heading else 0,  # desired heading; whether the robot stood
             "hidden": self._network.num_hidden,
             "begun": int(begins),
             "past": self._past_size,
@@ -183,7 +183,7 @@ class NetworkStage:
     # ------------------------------------------------------------ one step
 
     def initial_memory(self, n: int) -> np.ndarray:
-        """No output and no frame yet; the robot stands. Shape (n, memory_size)."""
+        """Memory before the first step, of a standing robot. Shape (n, memory_size)."""
         memory = np.zeros((n, self.memory_size))
         if self._clock is not None:
             memory[:, self._places["phases"]] = self._clock.initial
@@ -214,10 +214,10 @@ class NetworkStage:
         return targets, after
 
     def watch(self, situation: Situation, memory: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """Remember a step that another network made.
+        """Update the memory by a step that another network made (shadowing).
 
-        Its outputs are taken to be those that would have given `targets`, so the network can go
-        on from there at any time. A recurrent state begins anew.
+        The last outputs are set to those that would have given `targets`, so that this network can
+        take over at any time. A recurrent state is reset.
 
         Args:
             situation: The batch.
@@ -241,12 +241,11 @@ class NetworkStage:
     def observe(
         self, situation: Situation, memory: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """What the network sees now.
+        """Compute the observation.
 
         Returns:
-            The observation, float32, shape (n, num_inputs); the second input, where there is
-            one; and the memory after the step, to which outputs and recurrent state are still
-            to be written.
+            The observation, float32, shape (n, num_inputs); the second input, or None; and the
+            memory after the step, still without outputs and recurrent state.
         """
         after = np.empty((len(memory), self.memory_size))
         now = self._terms(self._compute_features(situation, memory, after))
@@ -279,7 +278,7 @@ class NetworkStage:
         return seen.astype(np.float32)
 
     def _rest(self, situation: Situation) -> np.ndarray:
-        """Targets of joints that no output moves. Shape (n, nu)."""
+        """Targets of the joints without an output. Shape (n, nu)."""
         targets = situation.shared[:, self._columns["targets"]].copy()
         targets[:, self._resting] = self._postures
         return targets
@@ -287,7 +286,7 @@ class NetworkStage:
     def _compute_features(
         self, situation: Situation, memory: np.ndarray, after: np.ndarray
     ) -> np.ndarray:
-        """All features of a batch; writes phases and heading to the memory `after`. (n, F)."""
+        """Compute all features; writes phases and heading to the memory `after`. (n, F)."""
         columns = self._columns
         features = np.zeros((len(memory), columns.size))
         features[:, : columns.num_shared] = situation.shared

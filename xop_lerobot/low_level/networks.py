@@ -1,4 +1,4 @@
-"""Networks of low-level policies, batched on one thread: ONNX, TorchScript, and plain layers."""
+"""Inference of low-level policy networks, batched on one thread: ONNX, TorchScript and MLPs."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class LoadedNetwork(ABC):
     """A network that turns observations into outputs.
 
     Attributes:
-        num_inputs: Width of the observation; None where the file does not say it.
-        num_outputs: Width of the outputs; None where the file does not say it.
-        num_hidden: Size of its recurrent state, 0 for none.
+        num_inputs: Width of the observation; None if the file does not state it.
+        num_outputs: Width of the outputs; None if the file does not state it.
+        num_hidden: Size of the recurrent state; 0 for none.
     """
 
     num_inputs: int | None = None
@@ -47,10 +47,10 @@ class LoadedNetwork(ABC):
 
 
 def load_network(file: Path) -> LoadedNetwork:
-    """Load the network of a file, by the ending of its name.
+    """Load the network of a file, by its file name extension.
 
     Raises:
-        PolicyFileError: If the ending is unknown, or the file not what it says.
+        PolicyFileError: If the extension is unknown or the file malformed.
     """
     loaders = {".onnx": _load_onnx, ".npz": _load_layers, ".pt": TorchNetwork}
     if file.suffix not in loaders:
@@ -63,15 +63,15 @@ def load_network(file: Path) -> LoadedNetwork:
 class OnnxNetwork(LoadedNetwork):
     """A network in ONNX Runtime: one input and one output, then any number of recurrent states.
 
-    The exported batch dimension may be fixed; it is relabelled, so that one call serves a
-    batch. Recurrent states are further inputs, each with an output of its shape, in the same order;
-    their batch is axis 1 where they have three axes, else axis 0. One thread computes: batches
-    of a sampling planner are too small to split, and the physics wants the other cores. A session
-    may be used by several threads at once.
+    A fixed exported batch dimension is made symbolic, so that one call serves a batch. Recurrent
+    states are further inputs, each with an output of its shape, in the same order; their batch
+    axis is 1 if they have three axes, else 0. It runs on one thread: the batches of a sampling
+    planner are too small to split, and the physics needs the other cores. A session is
+    thread-safe.
 
     Args:
         model: The network.
-        source: Where it comes from, for messages.
+        source: Its file, for messages.
 
     Raises:
         PolicyFileError: If its inputs or outputs have other shapes.
@@ -103,7 +103,7 @@ class OnnxNetwork(LoadedNetwork):
             (tensor.name, shape) for tensor, shape in zip(inputs[1:], states, strict=True)
         ]
         self.num_hidden = sum(_count(shape) for _, shape in self._states)
-        del model.graph.value_info[:]  # shapes with the old batch
+        del model.graph.value_info[:]  # inferred shapes with the old batch dimension
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
@@ -118,7 +118,7 @@ class OnnxNetwork(LoadedNetwork):
     def _pair_states(
         inputs: Sequence[onnx.ValueInfoProto], outputs: Sequence[onnx.ValueInfoProto]
     ) -> list[str]:
-        """Outputs that are the states after the step, one for each state before it."""
+        """Names of the state outputs, in the order of the state inputs; matched by shape."""
         left = list(outputs)
         pairs = []
         for tensor in inputs:
@@ -146,13 +146,13 @@ class OnnxNetwork(LoadedNetwork):
 
 
 class TorchNetwork(LoadedNetwork):
-    """A TorchScript network, run row by row: such files are often exported for one robot.
+    """A TorchScript network, evaluated row by row, since many are exported for a batch of one.
 
     Args:
         file: Its file.
 
     Raises:
-        PolicyFileError: If it is no TorchScript.
+        PolicyFileError: If it is not TorchScript.
     """
 
     def __init__(self, file: Path) -> None:
@@ -180,20 +180,19 @@ class TorchNetwork(LoadedNetwork):
 
 
 class ReferenceNetwork:
-    r"""A network of standardised numbers, :math:`y = \mu_y + \sigma_y f((x - \mu_x)/\sigma_x)`.
+    r"""A network with normalisation, :math:`y = \mu_y + \sigma_y f((x - \mu_x)/\sigma_x)`.
 
     Args:
         network: f.
-        file: Means and deviations, arrays of `STATISTICS`; nothing but arrays is unpickled. None
-            for a network without.
+        file: File with the arrays of `STATISTICS`; only arrays are unpickled. None for a network
+            without normalisation.
 
     Attributes:
         num_inputs: Width of x.
         num_outputs: Width of y.
 
     Raises:
-        PolicyFileError: If the file does not hold them, or without it the network does not say
-            how wide its output is.
+        PolicyFileError: If the file lacks an array, or the width of the output is unknown.
     """
 
     STATISTICS = ("input_mean", "input_std", "output_mean", "output_std")
@@ -215,7 +214,7 @@ class ReferenceNetwork:
         self.num_inputs, self.num_outputs = inputs, outputs
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Evaluate it. Shape (n, num_inputs) -> (n, num_outputs)."""
+        """Evaluate the network. Shape (n, num_inputs) -> (n, num_outputs)."""
         nothing = np.zeros((len(values), 0))
         if self._statistics is None:
             return self._network(values.astype(np.float32), nothing)[0]
@@ -245,13 +244,13 @@ def _shape(tensor: onnx.ValueInfoProto) -> tuple[int | str, ...]:
 
 
 def _count(shape: tuple[int | str, ...]) -> int:
-    """Numbers of one robot's state: (layers, batch, size) or (batch, size)."""
+    """Size of one robot's state, of shape (layers, batch, size) or (batch, size)."""
     layers = int(shape[0]) if len(shape) == 3 else 1
     return layers * int(shape[-1])
 
 
 def _to_state(hidden: np.ndarray, shape: tuple[int | str, ...]) -> np.ndarray:
-    """States as the network takes them. Shape (n, layers * size) -> (layers, n, size)."""
+    """Reshape states for the network. Shape (n, layers * size) -> (layers, n, size)."""
     state = hidden.astype(np.float32)
     if len(shape) == 2:
         return state
@@ -260,7 +259,7 @@ def _to_state(hidden: np.ndarray, shape: tuple[int | str, ...]) -> np.ndarray:
 
 
 def _from_state(state: np.ndarray) -> np.ndarray:
-    """The reverse of `_to_state`."""
+    """Inverse of `_to_state`."""
     if state.ndim == 2:
         return state
     return state.transpose(1, 0, 2).reshape(state.shape[1], -1)
@@ -272,9 +271,9 @@ def build_mlp(
     """Build a multilayer perceptron as an ONNX model.
 
     Args:
-        weights: Matrix of each layer. Shapes (inputs, outputs), float32.
-        biases: Offset of each layer. Shapes (outputs,), float32.
-        activation: Name of an ONNX operator.
+        weights: Weight matrix of each layer. Shapes (inputs, outputs), float32.
+        biases: Bias of each layer. Shapes (outputs,), float32.
+        activation: ONNX operator between layers.
     """
     from onnx import TensorProto, helper, numpy_helper  # noqa: PLC0415
 
@@ -307,7 +306,7 @@ def load_weights(file: Path) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Read the layers of a multilayer perceptron.
 
     Returns:
-        Matrices (inputs, outputs) and offsets (outputs,), float32.
+        Weight matrices (inputs, outputs) and biases (outputs,), float32.
 
     Raises:
         PolicyFileError: If the file is missing, malformed, or its layers do not chain.
@@ -348,7 +347,7 @@ def save_weights(file: Path, weights: Sequence[np.ndarray], biases: Sequence[np.
 
 
 def _load_statistics(file: Path, names: Sequence[str]) -> tuple[np.ndarray, ...]:
-    """Arrays `names` of a PyTorch file, flat. Nothing but arrays is unpickled."""
+    """Load the arrays `names` of a PyTorch file, flattened. Only arrays are unpickled."""
     import torch  # noqa: PLC0415
 
     allowed: list[Any] = [
@@ -358,7 +357,7 @@ def _load_statistics(file: Path, names: Sequence[str]) -> tuple[np.ndarray, ...]
         np.dtype,
         *(type(np.dtype(kind)) for kind in (np.float32, np.float64)),
     ]
-    # Files of NumPy 1 name these in `numpy.core`.
+    # Files written with NumPy 1 refer to these functions in `numpy.core`.
     aliases: list[Any] = [
         (function, f"numpy.core.multiarray.{function.__name__}") for function in allowed[:2]
     ]

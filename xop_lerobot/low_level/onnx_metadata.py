@@ -1,11 +1,11 @@
-"""ONNX files that describe themselves, as mjlab and holosoma export them, read as tables.
+"""Policy tables from the metadata of ONNX files, as exported by mjlab and holosoma.
 
-mjlab writes joints, gains, default posture, action scale, and of every term of the observation its
-name, scale, clip and history; such a file needs no table. holosoma writes joints, gains and command
-ranges; the layout is that of its table, ``holosoma``.
+mjlab stores joints, gains, default posture, action scale, and name, scale, clip and history of
+every observation term; such a file needs no table. holosoma stores joints, gains and command
+ranges; the layout of its observation is that of the built-in table ``holosoma``.
 
-Neither says who moves the arms: here they follow their targets, as a teleoperator wants it, and the
-network sees them where they are.
+Neither states who controls the arms. Here they follow their targets, as teleoperation needs it, and
+the network observes their measured angles.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from xop_lerobot.low_level import description as d
 SUFFIX = ".onnx"
 
 VELOCITIES = ("vx", "vy", "yaw_rate")
-"""What a command of both is, in this order."""
+"""Command entries of both exporters, in order."""
 
 
 def read_metadata(file: Path) -> dict[str, str]:
-    """Metadata of an ONNX file.
+    """Read the metadata of an ONNX file.
 
     Raises:
-        PolicyFileError: If it is missing or no ONNX file.
+        PolicyFileError: If it is missing or not an ONNX file.
     """
     import onnx  # noqa: PLC0415
     from google.protobuf.message import DecodeError  # noqa: PLC0415
@@ -46,15 +46,15 @@ def read_metadata(file: Path) -> dict[str, str]:
 def make_table(
     file: Path, find_robot: Callable[[tuple[str, ...]], str], holosoma: d.PolicyTable
 ) -> d.PolicyTable:
-    """Make the table of an ONNX file that describes itself.
+    """Make the policy table of an ONNX file with metadata.
 
     Args:
         file: The file.
-        find_robot: Names the robot that has some joints.
-        holosoma: The table of holosoma's layout.
+        find_robot: Returns the name of the robot that has the given joints.
+        holosoma: Table with holosoma's observation layout.
 
     Raises:
-        PolicyFileError: If the file says too little, or what can't be shown here.
+        PolicyFileError: If the metadata is incomplete or not supported.
     """
     metadata = read_metadata(file)
     try:

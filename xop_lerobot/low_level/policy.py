@@ -1,4 +1,4 @@
-"""The interface of a low-level policy π(x, a, h)."""
+"""Interface of low-level policies π(x, a, h): batched closed-loop controllers at 50 Hz."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ POLICY_DT = 0.02
 
 
 class PolicyOutput(NamedTuple):
-    """What one step of a low-level policy returns.
+    """Output of one step of a low-level policy.
 
     Attributes:
         targets: Control of every actuator, in the model's actuator order. Shape (n, nu).
@@ -35,37 +35,37 @@ class LowLevelPolicy(ABC):
     r"""A closed-loop controller :math:`\tau_k = \pi(x_k, a_k, h_k)` (Eq. 1b), batched.
 
     The policy runs at 50 Hz; the model's actuators turn its targets into torques at every
-    physics step, so gains and torque limits live in the model. All state between steps is in
-    `memory`, a plain array: it is copied from the plant into every rollout at each solve.
-    An implementation is a pure function of its arguments, never of what it was asked before.
+    physics step, so gains and torque limits are part of the model. All state between steps is in
+    `memory`, a plain array that each solve copies from the plant into every rollout. So an
+    implementation must be a pure function of its arguments.
     """
 
     name: str
     memory_size: int
     arm_limits: Mapping[str, tuple[float, float]] = {}
-    """Angles within which arm targets are kept, by joint, where the robot does not stand or walk
-    safely beyond [rad]; `benchmarks/run_policies.py` tells."""
+    """Limits of the arm targets, by joint, beyond which the robot does not stand or walk safely
+    [rad]; measured by `benchmarks/run_policies.py`."""
 
     ranges: Mapping[Mode, Mapping[str, tuple[float, float]]] = {}
-    """Commands that it can do in each mode, by entry, where that is less than the robot's."""
+    """Command ranges that it can follow, by mode and entry, where narrower than the robot's."""
     dead_zones: Mapping[str, float] = {}
-    """Size of a velocity under which nothing happens, by entry of the command."""
+    """Magnitude of a velocity below which the policy does not react, by command entry."""
     stop_rates: Mapping[str, float] = {}
-    """Rate limits of velocities that end because the robot is to stand, by entry."""
+    """Rate limits of velocities when the robot has to stop, by command entry."""
     rest: RestMap | None = None
-    """How the base of a standing robot leans and moves unasked; None where that is not known."""
+    """Lean and displacement of the base of a standing robot; None if unknown."""
 
     def adapt(self, model: mujoco.MjModel) -> None:
-        """Give `model`, of a plant or of rollouts, the motors that the policy was trained with.
+        """Set the motors of `model` to those that the policy was trained with.
 
-        `PolicyLoop` and `PolicyRollout` call it, so nobody else has to. Nothing by default: the
-        robots' models have the gains of their own policies.
+        `PolicyLoop` and `PolicyRollout` call it for the models of plant and rollouts. Does nothing
+        by default, since the robots' models have the gains of their own policies.
         """
         del model
 
     @abstractmethod
     def initial_memory(self, n: int = 1) -> np.ndarray:
-        """Memory of a policy that has not run yet. Shape (n, memory_size)."""
+        """Memory before the first step. Shape (n, memory_size)."""
 
     @abstractmethod
     def act(
@@ -89,5 +89,5 @@ class LowLevelPolicy(ABC):
                 Shape () or (n,).
 
         Returns:
-            Targets and the memory after the step; the inputs are left untouched.
+            Targets, and the memory after the step. The inputs are not modified.
         """

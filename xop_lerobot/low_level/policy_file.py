@@ -1,4 +1,4 @@
-"""Where a policy's files come from: given, beside their table, in the cache, or downloaded once."""
+"""Files of policies: given by the user, beside their table, in the cache, or downloaded once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def compute_sha256(path: Path) -> str:
 
 
 def cache_folder() -> Path:
-    """Return where downloaded files are kept."""
+    """Return the folder of downloaded files."""
     import pooch  # noqa: PLC0415
 
     return Path(pooch.os_cache("xop-lerobot"))
@@ -30,10 +30,10 @@ class FileFinder:
     """Finds the files of one policy.
 
     Attributes:
-        title: The policy, as messages call it.
-        folder: Folder of its table, where its files may lie too.
-        given: File or folder that the user gives; None for none.
-        num_files: How many files it has; a single one may be given by its own path.
+        title: Name of the policy in messages.
+        folder: Folder of its table, which may contain its files.
+        given: File or folder given by the user; None for none.
+        num_files: Number of its files; a single one may be given by its own path.
     """
 
     title: str
@@ -44,12 +44,12 @@ class FileFinder:
     def find(self, file: File) -> Path:
         """Find one file.
 
-        A file that the user gives may have another checksum (one may train one's own); this is
-        logged. A cached or downloaded file must have the known one.
+        A file given by the user, or beside the table, may have another checksum, since it may be
+        self-trained; that is logged. A cached or downloaded file must have the expected one.
 
         Raises:
-            PolicyFileError: If it is not where the user says; if the cached or downloaded file is
-                altered; if it is nowhere and cannot be downloaded (names the ways to provide it).
+            PolicyFileError: If the given file is missing; if a cached or downloaded file has
+                another checksum; if none is found and the download fails (lists the remedies).
         """
         if self.given is not None:
             return self._take_given(file, self.given)

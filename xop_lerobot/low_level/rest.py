@@ -1,4 +1,4 @@
-"""Where the base of a standing robot comes to rest under a command."""
+"""Rest pose of the base of a standing robot as a function of its command."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from xop_lerobot.core.errors import BadValue
 
 
 class BaseRest(NamedTuple):
-    """Posture of the base at rest, and its derivatives by the command.
+    """Pose of the base at rest, and its derivatives by the command.
 
     Attributes:
         pitch: Pitch of the base [rad]. Shape (...).
-        forward: Place of the base ahead of the middle of the feet [m]. Shape (...).
+        forward: Forward position relative to the middle of the feet [m]. Shape (...).
         pitch_slope: Derivative of `pitch` by the two entries. Shape (..., 2).
         forward_slope: Derivative of `forward` by the two entries. Shape (..., 2).
     """
@@ -27,18 +27,18 @@ class BaseRest(NamedTuple):
 
 
 class RestMap:
-    r"""Pitch and place of a standing robot's base as a function of two entries of its command.
+    r"""Pitch and position of a standing robot's base as a function of two command entries.
 
-    A policy that balances a low or bent robot leans its pelvis and moves its hips unasked. The map
-    is measured on a grid (`python -m benchmarks.run_policies --parts rest`) and bilinear between:
-    :math:`g(a) = \sum_{ij} \lambda_i(a_1) \lambda_j(a_2) g_{ij}`; beyond the grid it stays as at
-    its edge.
+    A policy that balances a low or bent robot leans the pelvis and moves the hips by itself. The
+    map is measured on a grid (`python -m benchmarks.run_policies --parts rest`) with bilinear
+    interpolation, :math:`g(a) = \sum_{ij} \lambda_i(a_1) \lambda_j(a_2) g_{ij}`, and constant
+    beyond the grid.
 
     Args:
-        axes: Two entries of the command and their increasing grid values.
-        pitch: Pitch of the base [rad]; a row for each value of the first entry.
-        forward: Place of the base ahead of the middle of the feet [m], the same.
-        held: Entries whose joint does not follow: the base leans in its place.
+        axes: Two command entries and their increasing grid values.
+        pitch: Pitch of the base [rad]; one row per value of the first entry.
+        forward: Forward position relative to the middle of the feet [m]; same layout.
+        held: Entries whose joint does not move: the base leans instead.
 
     Raises:
         BadValue: If axes or rows do not fit.
@@ -68,7 +68,7 @@ class RestMap:
         self._values = np.stack([np.array(pitch, dtype=float), np.array(forward, dtype=float)])
 
     def __call__(self, first: np.ndarray, second: np.ndarray) -> BaseRest:
-        """Compute the posture for values of the two entries, which broadcast. Shapes (...)."""
+        """Compute the rest pose for values of the two entries, which broadcast. Shapes (...)."""
         (i, s, inside_s), (j, t, inside_t) = (
             _locate(values, np.asarray(at, dtype=float))
             for values, at in zip(self._axes, (first, second), strict=True)
@@ -85,7 +85,7 @@ class RestMap:
 
 
 def _locate(values: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cell, share of it, and slope of the share (zero beyond the grid)."""
+    """Grid cell, fraction within it, and derivative of the fraction (zero beyond the grid)."""
     cell = np.clip(np.searchsorted(values, at, side="right") - 1, 0, len(values) - 2)
     width = values[cell + 1] - values[cell]
     share = (at - values[cell]) / width

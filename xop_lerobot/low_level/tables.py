@@ -1,4 +1,4 @@
-"""Policies that are tables: those that ship with the package, and a user's own."""
+"""Loading of policy tables: the built-in ones, and a user's own."""
 
 from __future__ import annotations
 
@@ -22,31 +22,32 @@ from xop_lerobot.morphology.morphology import list_robots, make_morphology
 logger = logging.getLogger(__name__)
 
 FOLDER = Path(__file__).parent / "policies"
-"""Tables that ship with the package."""
+"""Folder of the built-in tables."""
 SUFFIX = ".toml"
 
 
 def list_tables() -> tuple[str, ...]:
-    """Names of the tables that ship with the package."""
+    """Names of the built-in tables."""
     return tuple(sorted(file.stem for file in FOLDER.glob(f"*{SUFFIX}")))
 
 
 def is_table(name: str) -> bool:
-    """Whether `name` is the path of a table, or of weights that describe themselves."""
+    """Whether `name` is the path of a table, or of an ONNX file."""
     return name.endswith((SUFFIX, onnx_metadata.SUFFIX))
 
 
 def find_robot(name: str) -> str:
-    """The robot of a table, by its name or its path.
+    """Name of a table's robot, by name or path of the table.
 
     Raises:
-        PolicyFileError: If there is no such table, or it is malformed.
+        UnknownName: If no table has this name.
+        PolicyFileError: If there is no such file, or it is malformed.
     """
     return read_table(find_table(name)).robot
 
 
 def find_table(name: str) -> Path:
-    """The file of a table, by its name or its path.
+    """File of a table, by name or path of the table.
 
     Raises:
         UnknownName: If no table has this name.
@@ -63,10 +64,10 @@ def find_table(name: str) -> Path:
 
 
 def read_table(file: Path) -> d.PolicyTable:
-    """Read a table: a TOML file, or what an ONNX file says of itself.
+    """Read a table from a TOML file, or from the metadata of an ONNX file.
 
     Raises:
-        PolicyFileError: If it is no TOML, or breaks the grammar of `description`; says where.
+        PolicyFileError: If it violates the syntax or the schema in `description`; says where.
     """
     if file.suffix == onnx_metadata.SUFFIX:
         return onnx_metadata.make_table(file, _name_robot, read_table(find_table("holosoma")))
@@ -87,10 +88,10 @@ def _tag(term: type[msgspec.Struct]) -> str:
 
 
 def _name_robot(names: tuple[str, ...]) -> str:
-    """The robot that has joints of these names.
+    """Name of the robot that has joints of these names.
 
     Raises:
-        ValueError: If none has.
+        ValueError: If no robot has.
     """
     from xop_lerobot.morphology.body import Body  # noqa: PLC0415  brings MuJoCo
 
@@ -106,13 +107,14 @@ def load_policy(
     """Load the policy of a table.
 
     Args:
-        name: Name of a table that ships with the package, or the path of one.
-        path: Its file, or the folder of its files; None to look beside the table, in the cache,
-            and where they are published.
-        network: What is run instead of all its files: a network in training.
+        name: Name of a built-in table, or the path of a table.
+        path: Its file, or the folder of its files; None to search beside the table, in the cache
+            and at the download address.
+        network: Network to run instead of all its files, for training.
 
     Raises:
-        PolicyFileError: If the table or a file is missing or not what it should be.
+        UnknownName: If no table has this name.
+        PolicyFileError: If the table or a file is missing or malformed.
     """
     file = find_table(name)
     table = read_table(file)
@@ -134,7 +136,7 @@ def _build(
 def _load_part(
     part: str, file: Path, table: d.PolicyTable, path: str | None, own: LoadedNetwork | None
 ) -> Stage:
-    """A network of this table, or the one of another policy that runs in the same mode."""
+    """Load a network of this table, or that of another policy for the same mode."""
     if part in table.networks:
         return _load_stage(part, file, table, path, own)
     other = find_table(part if not is_table(part) else str(file.parent / part))
@@ -154,7 +156,7 @@ def _load_stage(
     joints, network = read_joints(table.robot), table.networks[name]
     given = None if path is None else Path(path).expanduser()
     finder = FileFinder(table.title, file.parent, given, len(_list_files(table)))
-    _say_terms(table)
+    _log_licence(table)
     weights_file = "a network in training" if own else finder.find(network.file)
     weights = own or load_network(Path(weights_file))
     reference = None
@@ -181,14 +183,14 @@ def _list_files(table: d.PolicyTable) -> list[d.File]:
     return files
 
 
-_said: set[str] = set()
+_logged: set[str] = set()
 
 
-def _say_terms(table: d.PolicyTable) -> None:
-    """Tell the licence, once a policy and process."""
-    if table.title in _said:
+def _log_licence(table: d.PolicyTable) -> None:
+    """Log the licence, once per policy and process."""
+    if table.title in _logged:
         return
-    _said.add(table.title)
+    _logged.add(table.title)
     logger.info("%s: licence %s, %s", table.title, table.license, table.source)
     if table.terms:
         logger.warning("%s: %s", table.title, table.terms)

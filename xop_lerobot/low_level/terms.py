@@ -1,8 +1,9 @@
-r"""From the terms of a table to one product: a frame is linear in a few features.
+r"""Compile the observation terms of a table to one affine map of features.
 
-All that a network sees of a state is linear in a few features :math:`\phi` of state, command and
-memory (angles, velocities, gravity, commanded angles, sines of the gait …), so the frames of a
-batch are one product, :math:`\phi M + b`; the table decides :math:`M` and :math:`b` once.
+Every observation term is affine in a few features :math:`\phi` of state, command and memory
+(angles, velocities, gravity, commanded angles, sines of the gait …). So the frames of a batch are a
+single matrix product, :math:`\phi M + b`, with :math:`M` and :math:`b` computed once from the
+table.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from xop_lerobot.low_level.joints import RobotJoints
 
 
 class FeatureColumns:
-    """Where each feature is: first those that all networks of a policy share.
+    """Columns of the features; first those that all networks of a policy share.
 
     Args:
         joints: The robot's joints.
-        num_actions: Outputs of the network.
-        num_phases: Phases of its clock.
-        num_references: Outputs of its reference.
+        num_actions: Number of outputs of the network.
+        num_phases: Number of phases of its clock.
+        num_references: Number of outputs of its reference network.
     """
 
     def __init__(
@@ -64,18 +65,18 @@ class FeatureColumns:
         return slice(columns.start, columns.stop)
 
     def pick(self, name: str, which: Sequence[int] | None = None) -> list[int]:
-        """Columns of a feature, or `which` of them."""
+        """Columns of a feature, or those at the indices `which`."""
         columns = self._columns[name]
         return list(columns) if which is None else [columns[index] for index in which]
 
 
 class LinearMap(NamedTuple):
-    r"""Terms as a function of the features, :math:`\phi M + b`.
+    r"""Terms as an affine map of the features, :math:`\phi M + b`.
 
     Attributes:
         matrix: M. Shape (F, w).
         offset: b. Shape (w,).
-        widths: Numbers of each term.
+        widths: Number of values of each term.
     """
 
     matrix: np.ndarray
@@ -83,19 +84,19 @@ class LinearMap(NamedTuple):
     widths: list[int]
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
-        """The terms of a batch. Shape (n, F) -> (n, w)."""
+        """Compute the terms of a batch. Shape (n, F) -> (n, w)."""
         return features @ self.matrix + self.offset
 
 
 class TermReader:
-    """Turns the terms of one network into a linear map.
+    """Compiles the terms of one network to a `LinearMap`.
 
     Args:
         joints: The robot's joints.
         default: The network's default posture [rad]. Shape (nu,).
         outputs: Joints of its outputs.
-        columns: Where the features are.
-        num_phases: Phases of its clock.
+        columns: Columns of the features.
+        num_phases: Number of phases of its clock.
     """
 
     def __init__(
@@ -110,10 +111,10 @@ class TermReader:
         self._columns, self._num_phases = columns, num_phases
 
     def read(self, terms: Sequence[d.Seen]) -> LinearMap:
-        """Turn `terms` into a map.
+        """Compile `terms` to a map.
 
         Raises:
-            BadValue: If a term names what the robot does not have.
+            BadValue: If a term names something that the robot does not have.
         """
         parts = [self._read(term) for term in terms]
         matrices, offsets = zip(*parts, strict=True) if parts else ([], [])
@@ -150,7 +151,7 @@ class TermReader:
         return matrix * scale, offset * scale
 
     def _find_sources(self, term: d.Seen) -> tuple[list[int], Sequence[int]]:
-        """Columns of the features that a term shows, and the joints that they belong to."""
+        """Columns of the features of a term, and the joints that they belong to."""
         joints, name = self._joints, _FEATURES.get(type(term), "")
         which: Sequence[int] | None = None
         chosen: Sequence[int] = ()
@@ -192,24 +193,24 @@ _FEATURES: Mapping[type, str] = {
     d.Actions: "actions",
     d.Sine: "sin",
     d.Cosine: "cos",
-    d.Constant: "walks",  # of which it takes nothing
+    d.Constant: "walks",  # placeholder: a constant uses no column
     d.Reference: "reference",
 }
-"""The feature that a term shows, or part of it."""
+"""Feature of which a term shows all or part."""
 
 
 def describe(term: d.Seen | d.Past) -> str:
-    """What a term is called in messages."""
+    """Name of a term in messages."""
     return f"term {term.__struct_config__.tag}"
 
 
 def spread_over(
     numbers: d.Numbers, joints: RobotJoints, chosen: Sequence[int], width: int, what: str
 ) -> np.ndarray:
-    """One number for each of `width`; numbers by pattern are for the joints `chosen`.
+    """Expand numbers to one per value; numbers by pattern are for the joints `chosen`. (width,).
 
     Raises:
-        BadValue: If there are too few or too many numbers, or no joints to name.
+        BadValue: If their count does not fit, or numbers by pattern have no joints.
     """
     if isinstance(numbers, Mapping):
         if not chosen:
