@@ -1,1 +1,1 @@
-"""What a robot is to the retargeter: models, command space, frames, contacts, parameters."""
+"""Robots: models, command space, tracked frames, contacts and planner parameters."""

@@ -1,4 +1,4 @@
-"""What a dataset says of a robot's body: proprioception, and the poses of its frames."""
+"""Proprioception and frame poses of a robot, as stored in datasets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BASE_KEYS = (
     "base.pitch.vel",
     "base.yaw.vel",
 )
-"""Height [m], tilt [rad], then linear [m/s] and angular [rad/s] velocity in the body's axes."""
+"""Height [m], roll and pitch [rad], then linear [m/s] and angular [rad/s] velocity, body axes."""
 
 
 class Body:

@@ -1,4 +1,8 @@
-"""How a robot touches the ground: on feet, which are lifted and set down, or on wheels."""
+"""Kinds of ground contact: `Feet`, which are lifted and set down, and `Wheels`.
+
+A `ContactKind` holds all that differs between them in the stance cost and in the state
+synchronisation (Eq. 4): residuals, velocity constraints and their standard deviations.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +22,14 @@ class Contact:
 
     Attributes:
         name: Site of its first point.
-        body: Body that it is.
-        point: Mean of its points in the body's frame, of a wheel its centre [m]. Shape (3,).
-        axis: Direction in the body's frame: of a foot, up; of a wheel, its axle. Shape (3,).
-        forward: Direction in the body's frame that a foot faces. Shape (3,).
-        height: Height of `point` over z = 0 when it bears its share of the weight [m].
+        body: Id of its body.
+        point: Mean of its contact points, or centre of the wheel, in the body's frame [m].
+            Shape (3,).
+        axis: Normal of the sole, or axle of the wheel, in the body's frame. Shape (3,).
+        forward: Forward direction of a foot in the body's frame. Shape (3,).
+        height: Height of `point` over z = 0 under its share of the weight [m].
         radius: Distance from `point` down to the ground, 0 for a foot [m].
-        rolls: Whether the body turns about `axis` against the one it is mounted on.
+        rolls: Whether the body turns on a hinge about `axis`.
     """
 
     name: str
@@ -38,15 +43,15 @@ class Contact:
 
 
 class ContactKind(ABC):
-    """What the contacts of a robot hold, and which residuals and velocities say so.
+    """Constraints of a kind of contact: its residuals and the velocities that are zero.
 
     Attributes:
         rows: Number of residuals of a contact; see `fill_residuals`.
-        height_row: Which of them is its height.
-        steps: Whether contacts are lifted and set down: then the lowest alone holds in mobile mode,
-            and one that has just touched down is not at rest yet.
-        tells_speed: Whether contacts tell the speed of the base better than any prediction.
-        keeps_level: Whether the base neither rolls nor pitches while all contacts are down.
+        height_row: Row of its height.
+        steps: Whether contacts are lifted and set down. If so, only the lowest is active in mobile
+            mode, and one that has just touched down is not yet at rest.
+        tells_speed: Whether contacts measure the base velocity better than any prediction.
+        keeps_level: Whether the base can neither roll nor pitch while all contacts are down.
     """
 
     rows: int
@@ -57,7 +62,7 @@ class ContactKind(ABC):
 
     @abstractmethod
     def holds_place(self, mode: Mode) -> bool:
-        """Whether a contact stays where it is while it is down."""
+        """Whether an active contact is stationary in `mode`."""
 
     @abstractmethod
     def make_contact(
@@ -69,16 +74,15 @@ class ContactKind(ABC):
         height: float,
         hinge: np.ndarray | None,
     ) -> Contact:
-        """Describe one contact of a robot that stands.
+        """Make one contact of a standing robot.
 
         Args:
             name: Site of its first point.
-            body: Body that it is.
+            body: Id of its body.
             point: Mean of its points in the body's frame [m]. Shape (3,).
             rotation: Orientation of the body in the world. Shape (3, 3).
             height: Height of `point` under the robot's weight [m].
-            hinge: Axis of the hinge on which the body turns, in its frame; None where it does not
-                turn on one. Shape (3,).
+            hinge: Axis of the body's hinge in its frame; None for a body without one. Shape (3,).
         """
 
     @abstractmethod
@@ -90,10 +94,10 @@ class ContactKind(ABC):
         """Standard deviation of each residual of a contact. Shape (rows,).
 
         Args:
-            place: Of its place on the ground [m].
-            heading: Of its heading [rad].
-            height: Of its height [m].
-            tilt: Of its tilt [rad].
+            place: Standard deviation of its horizontal position [m].
+            heading: Standard deviation of its heading [rad].
+            height: Standard deviation of its height [m].
+            tilt: Standard deviation of its tilt [rad].
         """
 
     @abstractmethod
@@ -114,11 +118,11 @@ class ContactKind(ABC):
             contact: The contact.
             rotation: Orientation of its body in the world. Shape (3, 3).
             point: Its point in the world [m]. Shape (3,).
-            stance: x, y [m] and heading [rad] of where it stands. Shape (3,).
+            stance: Stance location: x, y [m] and heading [rad]. Shape (3,).
             linear: Jacobian of the velocity of its point, world axes. Shape (3, nv).
             angular: Jacobian of the angular velocity of its body, world axes. Shape (3, nv).
-            error: Receives the residuals. Shape (rows,).
-            jacobian: Receives their derivatives. Shape (rows, nv).
+            error: Output: the residuals. Shape (rows,).
+            jacobian: Output: their derivatives. Shape (rows, nv).
         """
 
     @abstractmethod
@@ -130,8 +134,8 @@ class ContactKind(ABC):
         Args:
             contact: The contact.
             rotation: Orientation of its body in the world. Shape (3, 3).
-            jacobian: Jacobian of the velocity of the material point that touches the ground, and
-                of its body's angular velocity, world axes. Shape (6, nv).
+            jacobian: Jacobian of the velocity of the material point on the ground and of its
+                body's angular velocity, world axes. Shape (6, nv).
 
         Returns:
             Shape (m, nv).
@@ -143,13 +147,13 @@ class ContactKind(ABC):
 
         Args:
             contact: The contact.
-            linear: Of a linear velocity [m²/s²].
-            angular: Of an angular velocity [rad²/s²].
+            linear: Variance of a linear velocity [m²/s²].
+            angular: Variance of an angular velocity [rad²/s²].
         """
 
 
 class Feet(ContactKind):
-    r"""Feet, of points on flat soles that are lifted and set down.
+    r"""Feet: flat soles with several contact points, which are lifted and set down.
 
     Residuals, with the point :math:`c_i = p + R(\theta) p_{c,i}(q)`:
 
@@ -161,8 +165,8 @@ class Feet(ContactKind):
     heading      :math:`\psi(R R_{c,i} e_x) - \psi^{world}_i`     1    rad
     ============ ================================================ ==== ====
 
-    Heading is an addition: the paper knows where a foot stands but not where it points. Linear and
-    angular velocity of a foot that holds are zero, 6 rows.
+    The heading is an addition to the paper, which has only the position of a foot. Linear and
+    angular velocity of a stance foot are zero, 6 rows.
     """
 
     rows = 7
@@ -172,7 +176,7 @@ class Feet(ContactKind):
     keeps_level = False
 
     def holds_place(self, mode: Mode) -> bool:
-        """A foot that bears stays in either mode."""
+        """Stance feet are stationary in either mode."""
         del mode
         return True
 
@@ -185,7 +189,7 @@ class Feet(ContactKind):
         height: float,
         hinge: np.ndarray | None,
     ) -> Contact:
-        """Describe a foot that stands flat; an ankle's hinge does not let it roll."""
+        """Make the contact of a flat foot; the hinge of its ankle is irrelevant."""
         del hinge
         up, forward = rotation.T[:, 2].copy(), rotation.T[:, 0].copy()
         return Contact(name, body, point, up, forward, height, 0.0, rolls=False)
@@ -217,7 +221,7 @@ class Feet(ContactKind):
         error[3:6] = up
         error[5] -= 1
         jacobian[3:6] = -skew(up) @ angular
-        # psi = atan2(f_y, f_x), f' = omega x f
+        # psi = atan2(f_y, f_x) of the forward direction f, with f' = omega x f
         length = forward[0] ** 2 + forward[1] ** 2
         turn = np.array([-forward[0] * forward[2], -forward[1] * forward[2], length]) / length
         jacobian[6] = turn @ angular
@@ -237,16 +241,16 @@ class Feet(ContactKind):
 
 
 class Wheels(ContactKind):
-    r"""Wheels that roll along and grip across, all of them down.
+    r"""Wheels that roll without slip, all of them on the ground.
 
     Residuals, with the centre :math:`c_i`, 1 row each: height :math:`e_z^\top c_i - r_i` [m] and
     axle :math:`e_z^\top R R_{c,i} e_y` [1]. Velocities that are zero while it rolls:
 
-    - Of a wheel on a hinge: of the material point that touches the ground, :math:`c - r e_z`, 3
-      rows: nothing sideways, nothing vertical, forward velocity of the centre equal to wheel speed
-      times radius.
-    - Of a wheel whose turning is no joint of the model: of its centre along the axle and vertical,
-      2 rows.
+    - Wheel on a hinge: velocity of the material point on the ground, :math:`c - r e_z`, 3 rows: no
+      lateral and no vertical velocity, forward velocity of the centre equal to wheel speed times
+      radius.
+    - Wheel whose rotation is not a joint of the model: velocity of its centre along the axle and
+      vertical, 2 rows.
     """
 
     rows = 2
@@ -256,7 +260,7 @@ class Wheels(ContactKind):
     keeps_level = True
 
     def holds_place(self, mode: Mode) -> bool:
-        """Wheels must roll in mobile mode."""
+        """Wheels are stationary in stationary mode only."""
         return mode is Mode.STATIONARY
 
     def make_contact(
@@ -268,7 +272,7 @@ class Wheels(ContactKind):
         height: float,
         hinge: np.ndarray | None,
     ) -> Contact:
-        """Describe a wheel by its centre; without a hinge its axle is to the left."""
+        """Make the contact of a wheel; without a hinge its axle is the world's Y axis."""
         axle = rotation.T[:, 1] if hinge is None else hinge
         forward, rolls = rotation.T[:, 0].copy(), hinge is not None
         return Contact(name, body, point, axle.copy(), forward, height, height, rolls)
@@ -278,7 +282,7 @@ class Wheels(ContactKind):
         return abs(math.asin(max(-1.0, min(1.0, upright))))
 
     def arrange_std(self, place: float, heading: float, height: float, tilt: float) -> np.ndarray:
-        """Standard deviation of height and axle; a wheel has no place. Shape (2,)."""
+        """Standard deviation of height and axle; a wheel has no stance location. Shape (2,)."""
         del place, heading
         return np.array([height, tilt])
 
@@ -303,7 +307,7 @@ class Wheels(ContactKind):
     def select_velocities(
         self, contact: Contact, rotation: np.ndarray, jacobian: np.ndarray
     ) -> np.ndarray:
-        """Velocity of the point on the ground, or of the centre. Shape (3, nv) or (2, nv)."""
+        """Velocity of the ground point, or of the centre. Shape (3, nv) or (2, nv)."""
         if contact.rolls:
             return jacobian[:3]
         return np.stack([(rotation @ contact.axis) @ jacobian[:3], jacobian[2]])

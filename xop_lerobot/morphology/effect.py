@@ -1,4 +1,4 @@
-"""What one entry of a command does to a robot, to first order."""
+"""First-order effect of one entry of a command, for the planner's command model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from xop_lerobot.core.command import Mode
 
 
 class Acts(Enum):
-    """On what an entry of a command acts."""
+    """Quantity that an entry of a command controls."""
 
     HEIGHT = "height of the base over the ground"
     JOINT = "angle of a joint"
@@ -23,13 +23,13 @@ class Effect:
     """Effect of one entry of a command.
 
     Attributes:
-        acts: On what it acts.
-        joint: The joint, where it acts on one.
+        acts: Quantity that the entry controls.
+        joint: The joint, for `Acts.JOINT`.
         lag_s: Time constant with which height or joint follow the command [s].
-        modes: Modes in which it has an effect at all.
-        sway_s: Where a velocity sways the base in stationary mode, by how much: displacement
-            over velocity, taken up with `lag_s` [m/(m/s)].
-        effort: How dear the entry is to the kinematic proposal, over the others [1].
+        modes: Modes in which it has an effect.
+        sway_s: Weight shift of the base in stationary mode: displacement per velocity, reached
+            with `lag_s` [m/(m/s)].
+        effort: Relative effort weight of the entry in the kinematic proposal [1].
     """
 
     acts: Acts

@@ -1,4 +1,4 @@
-"""What a robot executes of an action: the one limit that teleoperator and robot share."""
+"""Limits of the actions that a robot executes, shared by teleoperator and robot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from xop_lerobot.core.command import RobotAction, check_vector
 from xop_lerobot.morphology.morphology import Morphology
 
 ARM_MAX_SPEED = 6.0
-"""Largest speed of arm targets that a robot executes [rad/s]; grippers are not limited."""
+"""Largest speed of arm targets [rad/s]; the speed of grippers is not limited."""
 
 
 def limit_action(
@@ -21,18 +21,18 @@ def limit_action(
     dt: float,
     arm_limits: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> RobotAction:
-    """What of `action` a robot executes after `previous` within `dt` [s].
+    """Limit an action to the bounds and rates that a robot can execute within `dt`.
 
-    Teleoperator and robot both call it, so that the recorded action is the executed one:
-    limiting twice is limiting once. Datasets hold single precision, so actions are rounded to
-    it, and a replayed action is the recorded one to the last bit.
+    Teleoperator and robot both call it, so that the recorded action is the executed one; the
+    function is idempotent. Actions are rounded to single precision, as stored in datasets, so that
+    a replayed action equals the recorded one bit by bit.
 
     Args:
         morphology: The robot.
-        action: What is wanted.
-        previous: What was executed last.
-        dt: Time since then [s].
-        arm_limits: Angles that the robot's low-level policy keeps arm joints within [rad].
+        action: Desired action.
+        previous: Action executed last.
+        dt: Time since `previous` [s].
+        arm_limits: Joint limits of the arms imposed by the low-level policy [rad].
 
     Raises:
         BadShape: If the command or the arms have the wrong size.
@@ -42,8 +42,8 @@ def limit_action(
     num_joints = sum(len(arm.joints) for arm in morphology.arms)
     arms = check_vector("arms", action.arms, len(morphology.arm_names)).copy()
     for joint, (low, high) in arm_limits.items():
-        place = morphology.arm_names.index(joint)
-        arms[place] = min(max(arms[place], low), high)
+        index = morphology.arm_names.index(joint)
+        arms[index] = min(max(arms[index], low), high)
     reach = ARM_MAX_SPEED * dt
     arms[:num_joints] = np.clip(
         arms[:num_joints], previous.arms[:num_joints] - reach, previous.arms[:num_joints] + reach
@@ -52,7 +52,7 @@ def limit_action(
 
 
 def round_action(action: RobotAction) -> RobotAction:
-    """The same in single precision, as datasets hold it."""
+    """Round an action to single precision, as datasets store it."""
     return RobotAction(_to_single(action.command), action.mode, _to_single(action.arms))
 
 

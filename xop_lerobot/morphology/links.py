@@ -1,7 +1,6 @@
-"""Rows of the tables that robots are built from, and what turns the rows into a MuJoCo model.
+"""Tables of links, shapes and frames, and functions that build MuJoCo models from them.
 
-Rows are plain data, so that a robot's numbers cost nothing to import; MuJoCo is loaded by the
-`add_*` functions alone.
+The rows are plain data that import quickly; only the `add_*` functions load MuJoCo.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 Vector = tuple[float, ...]
 
 FLOOR_BIT, ROBOT_BIT, OBJECT_BIT = 1, 2, 4
-"""Collision bits: what a geom is (`contype`) and what it meets (`conaffinity`)."""
+"""Collision bits: what a geom is (`contype`) and what it collides with (`conaffinity`)."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class Joint:
     Attributes:
         name: Its name.
         axis: Axis in the child link's frame.
-        limits: Lower and upper limit [rad or m], None for a joint that turns without end.
+        limits: Lower and upper limit [rad or m]; None for a continuous joint.
         effort: Largest torque or force [N m or N].
         velocity: Largest velocity [rad/s or m/s].
         slides: Whether it slides rather than turns.
@@ -74,18 +73,18 @@ class Link:
 
 @dataclass(frozen=True)
 class Shape:
-    """A primitive that collides, is seen, or both.
+    """A primitive for collision, display, or both.
 
     Attributes:
         link: The link it is fixed to.
         kind: ``"box"``, ``"sphere"``, ``"ellipsoid"``, ``"cylinder"`` or ``"capsule"``.
-        size: Half sizes, or radius and half length, as MuJoCo takes them [m].
+        size: Half sizes, or radius and half length, as in MuJoCo [m].
         pos: Centre in the link's frame [m].
         rpy: Roll, pitch, yaw in the link's frame [rad].
-        ends: Both ends of the axis of a capsule or cylinder, in place of `pos` and `rpy` [m].
-        material: Name of its material, None for a shape that is not seen.
+        ends: End points of the axis of a capsule or cylinder, instead of `pos` and `rpy` [m].
+        material: Name of its material; None for an invisible shape.
         collides: Whether it collides with the floor, with objects and with other links.
-        name: Its name, where someone asks for it.
+        name: Name of the geom; empty for none.
     """
 
     link: str
@@ -100,7 +99,7 @@ class Shape:
 
 
 def mirror(shape: Shape) -> Shape:
-    """Return the right-hand twin of a left-hand shape (y to -y)."""
+    """Return the right-hand counterpart of a left-hand shape (y to -y)."""
     x, y, z = shape.pos
     roll, pitch, yaw = shape.rpy
     ends = shape.ends
@@ -115,7 +114,7 @@ def mirror(shape: Shape) -> Shape:
 
 
 def look(link: str, kind: str, size: tuple[float, ...], material: str, **where: Any) -> Shape:
-    """Return a shape that is seen and collides with nothing."""
+    """Return a visible shape without collisions."""
     return Shape(link, kind, size, material=material, collides=False, **where)
 
 
@@ -149,7 +148,7 @@ class Frame:
 
 
 def new_spec(name: str, timestep: float) -> mujoco.MjSpec:
-    """Make an empty model with the settings every robot shares.
+    """Make an empty model with the settings that all robots share.
 
     Args:
         name: Name of the model.
@@ -162,7 +161,7 @@ def new_spec(name: str, timestep: float) -> mujoco.MjSpec:
     spec.compiler.degree = False
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    # Islands pay off with many separate bodies; one robot is faster without.
+    # Constraint islands pay off for many separate bodies; a single robot is faster without them.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
     return spec
 
@@ -191,7 +190,7 @@ def add_links(spec: mujoco.MjSpec, links: Iterable[Link], free_joint: str) -> No
 
 
 def add_materials(spec: mujoco.MjSpec, colours: Mapping[str, Vector]) -> None:
-    """Add matt materials: name to red, green, blue and gloss, each 0 to 1."""
+    """Add matte materials: name to red, green, blue and gloss, each 0 to 1."""
     for name, (red, green, blue, gloss) in colours.items():
         spec.add_material(
             name=name, rgba=(red, green, blue, 1), specular=gloss, shininess=0.4, reflectance=0
@@ -199,7 +198,7 @@ def add_materials(spec: mujoco.MjSpec, colours: Mapping[str, Vector]) -> None:
 
 
 def add_shapes(spec: mujoco.MjSpec, shapes: Iterable[Shape]) -> None:
-    """Add geoms: seen ones in group 2, hidden collision geoms in group 3; none adds mass."""
+    """Add geoms: visible ones in group 2, invisible collision geoms in group 3; none adds mass."""
     import mujoco  # noqa: PLC0415
 
     for shape in shapes:
@@ -232,13 +231,13 @@ def add_sites(spec: mujoco.MjSpec, frames: Iterable[Frame]) -> None:
 
 
 def add_camera(spec: mujoco.MjSpec, frame: Frame, fovy: float, *, tracking: bool = False) -> None:
-    """Add a camera that looks along the X axis of `frame`, whose Z axis is up in the picture.
+    """Add a camera that looks along the X axis of `frame`, whose Z axis is up in the image.
 
     Args:
         spec: The model.
-        frame: Where the camera is.
+        frame: Pose of the camera.
         fovy: Vertical field of view [deg].
-        tracking: Whether it follows the link's position alone and keeps its direction.
+        tracking: Whether it follows only the link's position and keeps its direction.
     """
     import mujoco  # noqa: PLC0415
 
@@ -264,7 +263,7 @@ def add_servo(
 
     Args:
         spec: The model.
-        joint: The joint it turns; its limits are those of the control too.
+        joint: The joint it drives, whose limits also limit the control.
         stiffness: k_p [N m/rad or N/m].
         damping: k_d [N m s/rad or N s/m].
         name: Name of the actuator, the joint's by default.

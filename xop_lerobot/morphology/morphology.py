@@ -1,4 +1,7 @@
-"""The interface that every robot implements, and the registry of robots."""
+"""Interface of robots, and the registry of them.
+
+A robot is a subclass of `Morphology` in a folder of its own; no other code names it.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +34,10 @@ class ArmChain:
     """One arm of a robot.
 
     Attributes:
-        frame: The tracked frame it carries, ``"left_wrist"``.
+        frame: The tracked frame at its end, such as ``"left_wrist"``.
         joints: Its joints from shoulder to wrist.
-        gripper: The name of its gripper target, None for a hand without one.
-        gripper_range: Opening of the gripper when closed and when open [m].
+        gripper: Name of its gripper target; None for a hand without one.
+        gripper_range: Target of the closed and of the open gripper [m].
     """
 
     frame: str
@@ -52,14 +55,14 @@ PAPER_HUMANOID = {
 
 @dataclass(frozen=True)
 class Variant:
-    """Which tracked frames drive which part of the body.
+    """Binding of tracked frames to a part of the body.
 
     Attributes:
-        targets: Tracked frames that the retargeter follows; the arms' inverse kinematics follow
+        targets: Tracked frames that the retargeter follows; inverse kinematics of the arms follow
             the other wrists.
         body: Command entries and arm joints that it decides; empty for the whole command.
-        configs: Parameters of the controller in each mode; the robot's own in those left out.
-        paper: The paper's parameters in each mode, for the preset `table1`.
+        configs: Controller parameters by mode; the robot's own for other modes.
+        paper: The paper's parameters by mode, for the preset `table1`.
     """
 
     targets: tuple[str, ...] = ("head",)
@@ -70,12 +73,12 @@ class Variant:
 
 @dataclass(frozen=True)
 class Work:
-    """What tasks have to know of a robot's hands beyond their kinematics.
+    """Properties of a robot's hands that tasks need beyond their kinematics.
 
     Attributes:
-        press: How far inside a box wrist goals have to be for a grip that holds [m].
-        tray: Whether a hand needs a plate to carry what lies on it.
-        walk: How far the robot goes before it carries something, at least and at most [m].
+        press: Depth of the wrist goals inside a box that gives a firm grip [m].
+        tray: Whether a hand needs a plate to carry an object on it.
+        walk: Smallest and largest distance that the robot walks before it picks something up [m].
     """
 
     press: float = 0.05
@@ -85,12 +88,12 @@ class Work:
 
 @dataclass(frozen=True)
 class Servos:
-    """Stiff servos on the joints of the command, which do just as they are told.
+    """Stiff position servos on the joints of the command.
 
     Attributes:
-        gap: How far a joint may be behind its target before its servo counts as giving way [rad].
-        load_share: Share of its largest torque that a joint may need to hold a posture [1]; the
-            rest is for moving there.
+        gap: Tracking error above which a servo counts as giving way [rad].
+        load_share: Fraction of the torque limit that a joint may need to hold a posture [1]; the
+            rest is reserved for motion.
     """
 
     gap: float
@@ -102,9 +105,9 @@ class WheelDrive:
     r"""Kinematics of the driven wheels: :math:`\omega = (f v_x + s v_y + t \Omega) / r` for each.
 
     Attributes:
-        radius: Radius of the wheels r [m].
-        wheels: f [1], s [1] and t [m] by the motor of the wheel. f and s are the shares of the
-            forward and the sideways velocity, negative where a wheel turns backwards for them.
+        radius: Radius r of the wheels [m].
+        wheels: Coefficients f [1], s [1] and t [m] of forward velocity, lateral velocity and yaw
+            rate, by the name of the wheel's motor.
     """
 
     radius: float
@@ -115,7 +118,7 @@ class WheelDrive:
         return np.array(list(self.wheels.values())).T
 
     def compute_speeds(self, forward: np.ndarray, left: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """Speeds of the wheels [rad/s], in the order of `wheels`.
+        """Compute the speeds of the wheels [rad/s], in the order of `wheels`.
 
         Args:
             forward: Forward velocity [m/s]. Shape (n,).
@@ -130,89 +133,89 @@ class WheelDrive:
 
 
 class Morphology(ABC):
-    """A robot, as far as retargeting is concerned. One folder per robot, no other code knows it.
+    """Description of a robot for simulation, planning and teleoperation.
 
-    The full model is the plant: everything collides, cameras and visuals are there. The
-    planning model has the same joints and actuators in the same order, and only the contacts
-    that matter for the prediction.
+    The full model is the plant, with all collisions, cameras and visuals. The planning model has
+    the same joints and actuators in the same order, and only the contacts that matter for the
+    prediction.
     """
 
     name: str
     command_space: CommandSpace
     policies: tuple[str, ...]
-    """Low-level policies of this robot beside the tables that name it; the first is its own."""
+    """Low-level policies of this robot beside the tables that name it; the first is the default."""
     frames: dict[str, str]
-    """Site that each tracked frame (`head`, `left_wrist`, `right_wrist`) is in the models."""
+    """Site of each tracked frame (`head`, `left_wrist`, `right_wrist`) in the models."""
     base_body: str
     arms: tuple[ArmChain, ...]
     arm_rest: dict[str, float]
     """Rest angle of each arm joint [rad]; joints that are not named rest at 0."""
     arm_limits: Mapping[str, tuple[float, float]] = {}
-    """Angles that inverse kinematics keep arm joints within, where that is less than they could
-    go [rad]: what the robot's low-level policies can do with."""
+    """Limits of arm joints in inverse kinematics, where narrower than the joint range [rad]:
+    beyond them the robot's low-level policies lose their balance."""
     contact_points: tuple[str, ...]
-    """Sites of the points on which the robot stands (four a foot; one a wheel)."""
+    """Sites of the contact points with the ground (four per foot, one per wheel)."""
     fall_height: float
-    """Base height over the ground under which the robot counts as fallen [m]."""
+    """Base height over the ground below which the robot counts as fallen [m]."""
     fall_tilt: float
-    """Tilt of the base over which the robot counts as fallen [rad]."""
+    """Tilt of the base above which the robot counts as fallen [rad]."""
     contact_kind: ContactKind
-    """How it touches the ground: on `Feet` or on `Wheels`."""
+    """Kind of its ground contacts: `Feet` or `Wheels`."""
 
     ramps: bool = False
-    """Whether its controller goes from each set of targets to the next in a straight line."""
+    """Whether its controller interpolates linearly between successive motor targets."""
     work: Work = Work()
-    """What tasks have to know of its hands."""
+    """Properties of its hands for tasks."""
     variants: Mapping[str, Variant] = {"v1": Variant()}
     """Bindings of targets to the body by name; the first is the default."""
     effects: tuple[Effect, ...]
-    """What each entry of the command does, in the order of `command_space`."""
+    """Effect of each entry of the command, in the order of `command_space`."""
     contact_groups: tuple[tuple[str, ...], ...]
-    """`contact_points` that touch the ground together: a foot, a wheel."""
+    """`contact_points` by foot or wheel."""
     velocity_lag_s: float = 0.3
-    """Time constant with which the base takes up a velocity; wheels have none [s]."""
+    """Time constant of the base's response to a velocity command [s]; 0 for wheels."""
     rest: RestMap | None = None
-    """How its base leans and moves unasked where it stands, under the policy that it is fitted to;
-    None for a base that does not, or of which that is not known."""
+    """Lean and displacement of its standing base under the policy that it is fitted to; None if
+    there is none or it is unknown."""
     pivot: float = 0.0
-    """Forward distance from the base's frame to its centre of turning [m]."""
+    """Forward distance from the base's frame to its centre of rotation [m]."""
     drive: WheelDrive | None = None
-    """How its driven wheels turn; None for a base without any."""
+    """Kinematics of its driven wheels; None for a base without wheels."""
     driving: Driving | None = None
-    """How it drives along a path; None for a base that goes to any side."""
+    """Limits for driving along a path; None for a base that can move sideways."""
     support: tuple[tuple[float, float], ...] = ()
-    """Corners (x, y) in the base's frame, counterclockwise, of the area on which a robot that
-    cannot step stands [m]; empty for one whose policy keeps the balance."""
+    """Corners (x, y) of the support area of a robot that cannot step, in the base's frame,
+    counterclockwise [m]; empty for a robot whose policy keeps the balance."""
     largest_offset: float = 0.2
-    """How far height and joints may rest beside their command and the planner counts on it, in
-    shares of the command's half range [1]."""
+    """Largest steady-state error of height and joints that the planner compensates, as a fraction
+    of half the range [1]."""
     servos: Servos | None = None
-    """The servos that follow the joints of the command; None where a policy follows it."""
+    """Servos on the joints of the command; None if a policy moves them."""
     posture_limits: Mapping[str, tuple[float, float]] = {}
-    """Angles within which joints of the command are kept [rad] wherever a goal does not need
-    more, by entry: the knees that it is to bend."""
+    """Preferred ranges of the command's joints in postures, by entry [rad], such as the direction
+    in which knees bend; exceeded only if a goal cannot be reached otherwise."""
     standing_reach: float = 0.3
-    """How far from where it rests the head of a robot that stands is led [m]."""
+    """Largest distance of the head's goal from its rest position in stationary mode [m]."""
 
     point_heights: tuple[float, float] | None = None
-    """Between which heights over the floor its palms get to points [m]; None keeps tasks at their
-    usual ones."""
+    """Range of heights over the floor that its palms reach [m]; None for the tasks' defaults."""
     top_heights: tuple[float, float] | None = None
-    """Between which heights a top may be for its hands to get beside a box on it [m]."""
+    """Range of table heights at which its hands can reach a box from both sides [m]."""
 
     hull_points: dict[str, float] = {}
-    """Sites on the hull of the robot and the radius around each [m], for obstacles."""
+    """Sites on the robot's hull and the radius around each [m], for obstacle avoidance; empty for
+    a robot that does not avoid obstacles."""
 
     hull_hands: tuple[str, ...] = ()
-    """Those of `hull_points` that are about hands, which may come near to what they work at."""
+    """`hull_points` of the hands, which may come close to objects that they work at."""
 
     @abstractmethod
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
-        """Build the robot alone, at its rest posture, as an editable model."""
+        """Build the robot without a scene, as an editable model."""
 
     @abstractmethod
     def standing_qpos(self) -> np.ndarray:
-        """Generalised position at rest on the ground, facing +X at the origin. Shape (nq,)."""
+        """Configuration at rest on the ground, at the origin and facing +X. Shape (nq,)."""
 
     @abstractmethod
     def mpc_config(self, mode: Mode) -> MpcConfig:
@@ -226,14 +229,14 @@ class Morphology(ABC):
 
     @cached_property
     def layout(self) -> ActionLayout:
-        """How actions of this robot are laid out."""
+        """Layout of this robot's actions."""
         return ActionLayout(self.command_space, self.arm_names)
 
     def fit(self, policy: LowLevelPolicy) -> Morphology:
-        """This robot with the commands that `policy` can do, and with how it rests.
+        """Return a copy with the command ranges and the rest map of a low-level policy.
 
         Raises:
-            BadValue: If they have nothing in common with the robot's.
+            BadValue: If a range of the policy does not overlap with the robot's.
         """
         fitted = copy.copy(self)
         vars(fitted).pop("layout", None)
@@ -244,7 +247,7 @@ class Morphology(ABC):
         return fitted
 
     def rest_action(self) -> RobotAction:
-        """Stand at rest: neutral command, stationary, arms at rest, grippers open."""
+        """Action at rest: neutral command, stationary mode, arms at rest, grippers open."""
         joints = [self.arm_rest.get(joint, 0.0) for arm in self.arms for joint in arm.joints]
         grippers = [arm.gripper_range[1] for arm in self.arms if arm.gripper]
         return RobotAction(
@@ -268,12 +271,12 @@ def list_robots() -> tuple[str, ...]:
 
 
 def say_robots() -> str:
-    """Names of this project's robots, as a help text lists them: ``"g1, rby1 or rby1m"``."""
+    """List the built-in robots for a help text: ``"g1, rby1 or rby1m"``."""
     return _say_choices(MORPHOLOGIES.built_in)
 
 
 def list_robot_types() -> str:
-    """LeRobot types of this project's robots, as an error names them: ``"xop_g1 or xop_rby1"``."""
+    """List the LeRobot types of the built-in robots for a message: ``"xop_g1 or xop_rby1"``."""
     return _say_choices([f"xop_{name}" for name in MORPHOLOGIES.built_in])
 
 
@@ -282,7 +285,7 @@ def _say_choices(names: Sequence[str]) -> str:
 
 
 def read_robot(name: str) -> str:
-    """A robot's name, as command lines take it: LeRobot's type of it, ``"xop_g1"``, will do too."""
+    """Parse a robot's name on a command line; its LeRobot type, ``"xop_g1"``, is accepted too."""
     return name.removeprefix("xop_")
 
 

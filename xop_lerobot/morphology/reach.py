@@ -1,4 +1,4 @@
-"""How far a robot reaches forward with straight arms."""
+"""Forward reach of a robot with stretched arms."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 
 from xop_lerobot.morphology.morphology import ArmChain, Morphology
 
-_SAMPLES, _ROUNDS, _GRID = 300, 4, 21
+_SAMPLES, _ROUNDS, _GRID = 300, 4, 21  # random samples, then coordinate search on a grid
 
 
 def compute_forward_reach(morphology: Morphology, model: mujoco.MjModel) -> float:
-    """Horizontal distance from the head to the wrists, arms stretched forward [m].
+    """Horizontal distance from the head to the wrists with the arms stretched forward [m].
 
-    The robot stands at rest. Each arm is as long as the largest distance from its first joint to
-    its wrist that its joints allow; held out level, it ends that far before the shoulder. The
-    mean over the arms is returned.
+    For the standing robot: forward distance of the shoulder from the head, plus the length of the
+    arm, which is the largest distance of the wrist from the first joint within the joint limits;
+    mean over the arms.
 
     Args:
         morphology: The robot.
@@ -34,7 +34,7 @@ def compute_forward_reach(morphology: Morphology, model: mujoco.MjModel) -> floa
 
 
 def _compute_length(model: mujoco.MjModel, data: mujoco.MjData, arm: ArmChain, site: str) -> float:
-    """Largest distance from the arm's first joint to `site`: by chance, then joint by joint."""
+    """Largest distance from the arm's first joint to `site`: random, then coordinate search."""
     rng = np.random.default_rng(0)
     joints = [model.joint(name) for name in arm.joints]
     addresses = [int(joint.qposadr[0]) for joint in joints]

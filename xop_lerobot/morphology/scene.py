@@ -1,4 +1,4 @@
-"""Scenes: the floor, the light and the objects that a robot stands among."""
+"""Scenes: floor, light and objects around a robot, and models of a robot in a scene."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import mujoco
 
 OFFSCREEN = (640, 480)
-"""Largest picture that can be rendered, width and height [px]."""
+"""Largest image that can be rendered, width and height [px]."""
 
 SCENES: Registry[Callable[[mujoco.MjSpec], None]] = Registry("scene")
 """Functions by name that add a scene's objects to a model with a robot and a floor."""
@@ -28,7 +28,7 @@ def build_scene_spec(
     """Build a robot in a scene, as an editable model.
 
     The robot comes first in qpos, qvel and among the actuators; the scene's objects follow.
-    The planning model has the floor alone, whatever the scene, and the sensors of `Sensing`.
+    The planning model has only the floor, whatever the scene, and the sensors of `Sensing`.
 
     Args:
         morphology: The robot.
@@ -44,8 +44,9 @@ def build_scene_spec(
     spec = morphology.build_spec(kind)
     add_floor(spec, seen=kind == "full")
     if kind == "full":
-        # MuJoCo's soft friction cone lets standing feet creep by a millimetre a second. This one
-        # holds them; it is two to four times as dear, so the short predictions do without.
+        # With MuJoCo's default friction cone, standing feet creep by a millimetre per second. The
+        # elliptic cone holds them, but costs two to four times as much, so the short predictions
+        # of the planning model do without.
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = 100
         add_sky(spec)
@@ -65,7 +66,7 @@ def build_model(morphology: Morphology, kind: ModelKind, scene: str = "empty") -
 
 
 def add_floor(spec: mujoco.MjSpec, *, seen: bool) -> None:
-    """Add the ground plane z = 0, endless to touch and 30 m wide to see."""
+    """Add the ground plane z = 0: infinite for contacts, displayed 30 m wide."""
     import mujoco  # noqa: PLC0415
 
     floor = spec.worldbody.add_geom(
@@ -93,7 +94,7 @@ def add_floor(spec: mujoco.MjSpec, *, seen: bool) -> None:
 
 
 def add_sky(spec: mujoco.MjSpec) -> None:
-    """Add a pale sky and lights without shadows; settings that keep software rendering fast."""
+    """Add a pale sky and lights without shadows, with settings for fast software rendering."""
     import mujoco  # noqa: PLC0415
 
     spec.add_texture(
@@ -119,18 +120,18 @@ def add_sky(spec: mujoco.MjSpec) -> None:
     spec.visual.global_.offwidth, spec.visual.global_.offheight = OFFSCREEN
     spec.visual.quality.offsamples = 0
     spec.visual.quality.shadowsize = 0
-    # Near and far planes are multiples of the extent, which would else grow with the scene.
+    # Near and far planes are multiples of the extent, which would otherwise grow with the scene.
     spec.stat.extent = 2
     spec.visual.map.znear = 0.01
     spec.visual.map.zfar = 30
-    # Coarser spheres and cylinders: half the triangles, the same picture at 320 × 240.
+    # Coarser spheres and cylinders: half the triangles, the same image at 320 × 240.
     spec.visual.quality.numslices = 20
     spec.visual.quality.numstacks = 10
 
 
 @SCENES.register("empty")
 def add_nothing(spec: mujoco.MjSpec) -> None:
-    """Add nothing: the robot stands on an endless floor."""
+    """Add nothing: the robot stands on an infinite floor."""
 
 
 @SCENES.register("room")
@@ -160,7 +161,7 @@ def add_walls(spec: mujoco.MjSpec, half: float) -> None:
 
 @SCENES.register("tabletop")
 def add_tabletop(spec: mujoco.MjSpec) -> None:
-    """Add a table in front of the robot, its top at 0.72 m, and a box of 12 cm that moves."""
+    """Add a table in front of the robot, its top at 0.72 m, and a movable box of 12 cm."""
     wood, steel = (0.72, 0.55, 0.38, 1), (0.35, 0.36, 0.38, 1)
     add_block(spec, "table_top", (0.75, 0, 0.70), (0.25, 0.5, 0.02), wood)
     for i, (x, y) in enumerate(((0.54, 0.45), (0.54, -0.45), (0.96, 0.45), (0.96, -0.45))):

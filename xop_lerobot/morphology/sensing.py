@@ -1,4 +1,4 @@
-"""What a rollout reads off the planning model: computed by MuJoCo in the rollout's own threads."""
+"""Sensors of the planning model that rollouts read; MuJoCo evaluates them in its own threads."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 def add_sensing(spec: mujoco.MjSpec, morphology: Morphology) -> None:
     """Add the sensors that `Sensing` reads to a robot's planning model.
 
-    Poses of the tracked frames, places of the contact and hull points, velocities of the contact
-    points, and the centre of mass. They cost next to nothing in the physics, where a pass of
-    forward kinematics over all predicted states would cost as much as a tenth of it.
+    Poses of the tracked frames, positions of the contact and hull points, velocities of the
+    contact points, and the centre of mass. They cost almost nothing in the physics, while forward
+    kinematics of all predicted states would cost about a tenth of it.
     """
     import mujoco  # noqa: PLC0415
 
@@ -46,7 +46,7 @@ def add_sensing(spec: mujoco.MjSpec, morphology: Morphology) -> None:
 
 
 class Sensing:
-    """Reads sensor data of rollouts by name. The leading dimensions are any.
+    """Reads sensor data of rollouts by name, with any leading dimensions.
 
     Args:
         model: Planning model with the sensors of `add_sensing`.

@@ -1,4 +1,4 @@
-"""What a robot says of its planner: weights of the costs and parameters of the controller."""
+"""Planner parameters of a robot: cost weights, controller parameters, and driving limits."""
 
 from __future__ import annotations
 
@@ -22,24 +22,22 @@ class CostWeights:
     Attributes:
         position: w_p, squared position error of each tracked frame [1/m²].
         orientation: w_θ, squared orientation error of each tracked frame [1/rad²].
-        tilt_share: Weight of a tilt over that of a turn about the vertical [1].
+        tilt_share: κ, weight of a tilt relative to a heading error [1].
         stance: w_s, squared velocity of the points in contact [s²/m²].
         collision: w_c, proximity to obstacles [1].
         collision_velocity: w_v, speed near obstacles [s²/m²].
         collision_decay: α, decay of the proximity with the distance [1/m].
         collision_velocity_decay: β, decay of the speed's term with the distance [1/m].
         collision_range: Distance from which an obstacle costs nothing; may be infinite [m].
-        upright: Squared tilt of each hand that is to stay level, while any is [1].
-        control: w_a, squared deviation of the command from its reference, each entry over its
-            scale [1].
-        change: Squared change of the command from the one being executed, each entry over its
-            scale [1].
-        terminal: w_f, factor on the tracking cost at the end of the horizon [1].
-        support: Squared distance of the zero-moment point out of the safe support area [1/m²].
-        lean: Squared distance of the centre of mass from where it rests on the base [1/m²].
-        load: Squared static torque of a joint beyond its share of what its motor can [1].
-        lateral: Squared angle of a base on wheels to where it shall face [1/rad²].
-        fall: Squared tilt of the base over the safe one, and height under it [1].
+        upright: Squared tilt of each hand under the upright constraint [1].
+        control: w_a, squared deviation of the command from its reference, in half ranges [1].
+        change: Squared change of the command from the executed one, in half ranges [1].
+        terminal: w_f, factor on the tracking cost at the end of the extrapolation [1].
+        support: Squared distance of the zero-moment point beyond the safe support area [1/m²].
+        lean: Squared distance of the centre of mass from its rest position on the base [1/m²].
+        load: Squared static torque of a joint beyond its allowed share of the motor limit [1].
+        lateral: Squared heading error of a wheeled base [1/rad²].
+        fall: Squared tilt of the base beyond the safe one, and height below the safe one [1].
     """
 
     position: float = 1.0
@@ -64,7 +62,7 @@ class CostWeights:
 
 @dataclass(frozen=True)
 class MpcConfig:
-    """Model predictive controller of one robot in one mode.
+    """Parameters of the model predictive controller of one robot in one mode.
 
     Attributes:
         optimizer: Name of the sampling optimizer: `kmppi`, or a registered one.
@@ -72,33 +70,33 @@ class MpcConfig:
         horizon: Length H of a rollout in low-level control steps of 20 ms [1].
         num_knots: Support points of the kernel interpolation [1].
         kernel_width: Width σ of the kernel [control steps].
-        kernel_mean: Mean of the interpolation: the last support value (`hold`), so that a steady
-            command stays, or `zero`, as in the original KMPPI.
-        shift: How far the plan moves between two solves: by the time that has passed
-            (`measured`), or by `one` control step whatever the time, as in the original.
-        sampling: How noise is drawn: `gaussian` or `antithetic`.
+        kernel_mean: Mean of the interpolation: the last support value (`hold`), so that a constant
+            command persists, or `zero`, as in the original KMPPI.
+        shift: Shift of the plan between two solves: by the elapsed time (`measured`), or always
+            by `one` control step, as in the original.
+        sampling: Kind of sampling noise: `gaussian` or `antithetic`.
         sample_plan: Whether the plan itself is the first sample.
         noise_std: Standard deviation of the samples by command name [its unit].
         temperature: λ of weighting `raw`, and of `importance_cost` [cost].
         effective_samples: Effective sample size that weighting `ess` aims at [1].
         weighting: How costs become weights: `raw` or `ess`.
         importance_cost: Whether MPPI's importance-sampling term is part of the cost.
-        min_noise: Share of `noise_std` that is left when the robot is at its goal [1].
-        full_noise_error: Tracking error at which the noise is full [m, rad].
+        min_noise: Fraction of `noise_std` that remains at the goal [1].
+        full_noise_error: Tracking error from which the full noise is used [m, rad].
         control_hz: Solves per second of the robot's clock [Hz].
-        preview_s: Time over which a goal is assumed to keep its velocity [s].
+        preview_s: Time for which a goal is assumed to keep its velocity [s].
         extrapolation_s: Time over which the terminal state is extrapolated [s].
-        reach: Distance at which a goal that runs away is held [m]; beyond it more error would
-            only contort the robot.
-        proposal_s: Time in which the kinematic candidate wants to be at the goal [s].
+        reach: Distance to which a goal is limited [m]; a larger error would only contort the
+            robot.
+        proposal_s: Time in which the kinematic proposal reaches the goal [s].
         candidates: Fixed commands that are tried beside the samples: the kinematic `proposal`;
-            `paced`, so much of it that all entries are there at once, within two control
+            `paced`, the proposal scaled so that all entries arrive together, within two control
             periods, for chains whose slow joints would lag behind; the `direct` mapping; the
-            `previous` command, which is still executed; and `stop`.
-        control_reference: Command from which the control cost counts: the `proposal`, `neutral`,
-            or `zero` as in the paper.
-        observe_drift: Whether a steady drift of a walking base, and where height and joints rest
-            beside their command, are observed and counted on.
+            `previous` (executed) command; and `stop`.
+        control_reference: Command of zero control cost: the `proposal`, `neutral`, or `zero` as in
+            the paper.
+        observe_drift: Whether the drift of a walking base and the steady-state offsets of height
+            and joints are observed and compensated.
         weights: Cost weights.
     """
 
@@ -159,7 +157,7 @@ class MpcConfig:
 
 @dataclass(frozen=True)
 class PaperParameters:
-    """What the paper's Table I gives for one robot and mode; the rest is common to all.
+    """Parameters of the paper's Table I for one robot and mode; the others are common to all.
 
     Attributes:
         num_samples: N [1].
@@ -176,22 +174,22 @@ class PaperParameters:
 
 @dataclass(frozen=True)
 class Driving:
-    """How a base that cannot go sideways drives along a path, gently enough for what stands on it.
+    """Limits of a nonholonomic base for driving along a path without tipping its upper body.
 
     Attributes:
         speed: Largest speed [m/s].
-        acceleration: Of the drive [m/s²].
-        braking: Of the drive [m/s²].
+        acceleration: Linear acceleration [m/s²].
+        braking: Linear deceleration [m/s²].
         turn: Largest yaw rate [rad/s].
-        turn_acceleration: Of the turn [rad/s²].
-        turn_braking: Of the turn [rad/s²].
-        centripetal: Largest acceleration across the heading: a tall robot tips over [m/s²].
-        detour_speed: Speed of a drive that makes room for a turn [m/s].
-        waist: Largest twist of the waist that turns the head [rad].
-        waist_speed: Its speed [rad/s].
-        arrival_twist: Largest twist in which the robot arrives [rad].
-        turning_twist: The same behind a goal that turns [rad].
-        lean: Distance that the torso bridges by itself [m].
+        turn_acceleration: Angular acceleration [rad/s²].
+        turn_braking: Angular deceleration [rad/s²].
+        centripetal: Largest lateral acceleration, at which a tall robot does not tip [m/s²].
+        detour_speed: Speed of a straight drive that makes room for a turn [m/s].
+        waist: Largest twist of the waist [rad].
+        waist_speed: Speed of the waist [rad/s].
+        arrival_twist: Largest waist twist at arrival [rad].
+        turning_twist: The same for a turning goal [rad].
+        lean: Distance to the goal that the torso can bridge [m].
     """
 
     speed: float

@@ -1,4 +1,7 @@
-"""Unitree G1 with 29 degrees of freedom, in the revision that FALCON was trained on."""
+"""Unitree G1 with 29 degrees of freedom, in the revision that FALCON was trained on.
+
+A biped whose legs and waist are controlled by a whole-body policy.
+"""
 
 from __future__ import annotations
 
@@ -24,26 +27,27 @@ ARM_JOINTS = (
 )  # fmt: skip
 
 STANDING = {"hip_pitch": -0.1, "knee": 0.3, "ankle_pitch": -0.2}
-"""FALCON's default leg angles [rad]; every other joint but the arms' stands at 0."""
+"""FALCON's default leg angles [rad]; all other joints except the arms are at 0."""
 
 STANDING_HEIGHT = 0.7836
-"""Pelvis height at which the contact spheres bear the robot's weight at `STANDING` [m]."""
+"""Pelvis height at which the contact spheres carry the robot's weight at `STANDING` [m]."""
 
 ARM_REST = {"shoulder_pitch": 0.0, "shoulder_roll": 0.1, "elbow": 0.2}
 """Rest angles of the left arm [rad]: elbows at the sides, forearms forward, palms inward."""
 
 ELBOW_MIN = 0.1
-"""Most bent elbow of the arms' inverse kinematics [rad]; at 0 the forearm is square to the upper
-arm. Beyond it the low-level policy pushes the arms aside by 0.3 to 1 rad, and falls in the end."""
+"""Lower limit of the elbows in inverse kinematics [rad]; at 0 the forearm is perpendicular to the
+upper arm. Further bent, the low-level policy pushes the arms aside by 0.3 to 1 rad and finally
+falls."""
 
 
 def _mirrored(side: str, joint: str, angle: float) -> float:
-    """Return a left-arm angle as it reads on `side`: roll and yaw change sign on the right."""
+    """Mirror a left-arm angle to `side`: roll and yaw change sign on the right."""
     return -angle if side == "right" and joint.endswith(("roll", "yaw")) else angle
 
 
 class G1(Morphology):
-    """G1: a biped whose legs and waist a whole-body policy drives."""
+    """Unitree G1 with the command height, waist angles and base velocity."""
 
     name = "g1"
     command_space = CommandSpace(
@@ -116,17 +120,17 @@ class G1(Morphology):
     contact_kind = Feet()
     standing_reach = STANDING_REACH
     point_heights, top_heights = (0.25, 1.3), (0.3, 1.1)
-    # The container is out of reach of who only stands: it walks first.
+    # Its arms do not reach a container from where it stands, so it walks there first.
     work = Work(press=0.02, walk=(0.5, 0.7))
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
-        """Build G1 alone."""
+        """Build G1 without a scene."""
         from xop_lerobot.morphology.g1.model import build_g1  # noqa: PLC0415
 
         return build_g1(kind)
 
     def standing_qpos(self) -> np.ndarray:
-        """Stand on the ground at the origin: free joint, then the joints in order. Shape (36,)."""
+        """Configuration standing at the origin: free joint, then the joints. Shape (36,)."""
         angles = []
         for link in LINKS:
             if link.joint is None:

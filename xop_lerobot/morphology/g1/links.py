@@ -1,6 +1,6 @@
-"""G1, 29 degrees of freedom, the revision of 35.1 kg that FALCON was trained on: its numbers.
+"""Link table of G1 with 29 degrees of freedom, in the 35.1 kg revision that FALCON was trained on.
 
-Published by the maker (29-DoF description, BSD-3-Clause) and used by FALCON; see
+Published by the manufacturer (29-DoF description, BSD-3-Clause) and used by FALCON; see
 docs/how_it_works/models.md.
 """
 

@@ -1,4 +1,4 @@
-"""G1 as a MuJoCo model, put together from its tables."""
+"""MuJoCo model of G1, built from its tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import mujoco
 
 TIMESTEP = 0.005
-"""Physics step [s], as FALCON was trained."""
+"""Physics step [s], as in FALCON's training."""
 
 GAINS = {
     "hip_pitch": (100.0, 2.5),
@@ -33,7 +33,7 @@ GAINS = {
     "wrist_pitch": (4.0, 0.2),
     "wrist_yaw": (4.0, 0.2),
 }
-"""FALCON's gains: k_p [N m/rad] and k_d [N m s/rad] by kind of joint."""
+"""FALCON's gains k_p [N m/rad] and k_d [N m s/rad] by kind of joint."""
 
 JOINT_DAMPING = 0.05
 """Viscous friction of every joint [N m s/rad]."""
@@ -46,15 +46,15 @@ FRICTION_LOSS, WRIST_FRICTION_LOSS = 0.2, 0.1
 
 
 def joint_kind(joint: str) -> str:
-    """Return the kind of a joint: ``"left_knee_joint"`` is a ``"knee"``."""
+    """Return the kind of a joint: ``"knee"`` for ``"left_knee_joint"``."""
     return joint.removesuffix("_joint").removeprefix("left_").removeprefix("right_")
 
 
 def build_g1(kind: str) -> mujoco.MjSpec:
-    """Build G1 alone.
+    """Build G1 without a scene.
 
-    The planning model has the feet's contact spheres alone, which meet the floor and nothing
-    else, no dry friction (29 constraint rows less), no visuals, no cameras.
+    The planning model has only the contact spheres of the feet, which collide with the floor
+    alone. It has no dry friction, which saves 29 constraint rows, no visuals and no cameras.
 
     Args:
         kind: ``"full"`` or ``"planning"``.
@@ -78,7 +78,7 @@ def build_g1(kind: str) -> mujoco.MjSpec:
         rows.add_materials(spec, shapes.MATERIALS)
         rows.add_shapes(spec, shapes.SHAPES)
         for geom in (spec.geom(f"{side}_sole") for side in ("left", "right")):
-            # The sole collides with links and objects; the ground is met by the spheres.
+            # Soles collide with links and objects; the spheres collide with the ground.
             geom.contype, geom.conaffinity = rows.ROBOT_BIT, rows.ROBOT_BIT | rows.OBJECT_BIT
         for first, second in shapes.EXCLUDED:
             spec.add_exclude(bodyname1=first, bodyname2=second)
@@ -91,7 +91,7 @@ def build_g1(kind: str) -> mujoco.MjSpec:
 
 
 def add_feet(spec: mujoco.MjSpec) -> None:
-    """Add four contact spheres a foot, which meet the floor."""
+    """Add four contact spheres per foot, which collide with the floor."""
     import mujoco  # noqa: PLC0415
 
     for side in ("left", "right"):

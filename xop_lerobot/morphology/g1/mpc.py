@@ -1,4 +1,4 @@
-"""Parameters of the model predictive controller for G1."""
+"""Planner parameters of G1."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ STATIONARY = (Mode.STATIONARY,)
 
 EFFECTS = (
     # While walking the policy neither squats nor turns its waist.
-    # Behind a ramp of 0.25 m/s the default policy is by 0.21 s, FALCON by 0.23.
+    # It lags behind a height ramp of 0.25 m/s by 0.21 s (default policy) or 0.23 s (FALCON).
     Effect(Acts.HEIGHT, lag_s=0.2, modes=STATIONARY),
     Effect(Acts.JOINT, "waist_yaw_joint", lag_s=0.2, modes=STATIONARY),
     Effect(Acts.JOINT, "waist_roll_joint", lag_s=0.1, effort=5.0),
     Effect(Acts.JOINT, "waist_pitch_joint", lag_s=0.1, effort=2.0),
-    # While standing it answers to a small velocity by shifting its weight, 2.4 cm for 0.1 m/s.
+    # While standing it responds to a small velocity by shifting its weight, 2.4 cm for 0.1 m/s.
     Effect(Acts.FORWARD, lag_s=0.3, sway_s=0.24, effort=0.3),
     Effect(Acts.LEFT, lag_s=0.3, sway_s=0.22, effort=0.3),
     Effect(Acts.TURN),
 )
 
 STANDING_REACH = 0.15
-"""How far a standing robot's head is led from where it rests [m]: what sway and waist serve."""
+"""Largest distance of a standing robot's head goal from rest [m]: weight shift plus waist."""
 
 CONFIGS = {
     Mode.STATIONARY: MpcConfig(
@@ -38,7 +38,7 @@ CONFIGS = {
         noise_std={
             "waist_roll": 0.03, "waist_pitch": 0.05, "vx": 0.25, "vy": 0.2, "yaw_rate": 0.3,
         },
-        # A walking robot that leans as its operator does pays with its balance.
+        # Leaning as the operator does costs a walking robot its balance: tilt counts half.
         weights=CostWeights(orientation=0.1, tilt_share=0.5, change=0.05),
     ),
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""G1: the primitives that make its looks and its collisions, its cameras and its named frames."""
+"""Shapes of G1 for display and collision, its cameras and named frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MATERIALS = {
 
 
 ACROSS = (1.5708, 0, 0)
-"""Roll that lays a cylinder along Y [rad]."""
+"""Orientation of a cylinder along Y: roll, pitch, yaw [rad]."""
 
 BODY = (
     Shape("pelvis", "ellipsoid", (0.072, 0.08, 0.062), (0, 0, -0.07), material="shell"),
@@ -78,11 +78,12 @@ FEET = tuple(
     )
     for side in ("left", "right")
 )
-"""Soles as seen; their lower side is above the contact spheres, which alone meet the ground."""
+"""Soles for display; they end above the contact spheres, which alone touch the ground."""
 
 SHAPES = (*BODY, *LEFT, *(mirror(shape) for shape in LEFT), *FEET)
 
-FOOT_POINTS = ((-0.05, 0.025, -0.03), (-0.05, -0.025, -0.03), (0.12, 0.03, -0.03), (0.12, -0.03, -0.03))  # fmt: skip  # noqa: E501
+FOOT_POINTS = ((-0.05, 0.025, -0.03), (-0.05, -0.025, -0.03), (0.12, 0.03, -0.03), (0.12, -0.03,
+-0.03))  # fmt: skip
 """Centres of the contact spheres in the ankle roll link [m]."""
 
 FOOT_RADIUS = 0.005
@@ -102,7 +103,7 @@ EXCLUDED = (
         ("elbow", "wrist_pitch"), ("elbow", "wrist_yaw"), ("wrist_roll", "wrist_yaw"),
     )),
 )  # fmt: skip
-"""Pairs of links whose shapes overlap by construction and never collide."""
+"""Pairs of links excluded from collision, since their shapes overlap by construction."""
 
 SITES = (
     Frame("head", "torso_link", (0.05, 0, 0.42)),
@@ -121,7 +122,7 @@ SITES = (
 HEAD_CAMERA = Frame(
     "head", "torso_link", (0.0576235, 0.01753, 0.41987), (0.6743, 0, -0.7384), (0.7384, 0, 0.6743)
 )
-"""The depth camera in the visor, pitched down by 0.8308 rad."""
+"""Depth camera in the visor, pitched down by 0.8308 rad."""
 
 HEAD_FOVY = 58.0
 """Vertical field of view of the head camera [deg]."""
@@ -130,7 +131,7 @@ WRIST_CAMERAS = tuple(
     Frame(f"{side}_wrist", f"{side}_wrist_yaw_link", (-0.01, 0, 0.085), (0.88, 0, -0.47))
     for side in ("left", "right")
 )
-"""On the thumb's side of the hand, looking along it."""
+"""On the thumb's side of the hand, looking along the hand."""
 
 WRIST_FOVY = 75.0
 """Vertical field of view of the wrist cameras [deg]."""

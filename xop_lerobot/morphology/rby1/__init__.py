@@ -1,4 +1,4 @@
-"""Rainbow Robotics RB-Y1 A v1.2: a wheeled base, a torso of six joints, two arms of seven."""
+"""Rainbow Robotics RB-Y1 A v1.2: differential-drive base, 6-joint torso, two 7-joint arms."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ ARM_READY = tuple(math.radians(angle) for angle in (0, 5, 0, -120, 0, 45, 0))
 """Left arm angles at the ready pose [rad]; joints 0, 2, 4 and 6 are 0, joint 1 is mirrored."""
 
 TORSO_RATES = (0.4, 0.5, 0.8, 0.6, 0.5, 1.2)
-"""Largest rates of the torso commands [rad/s]. The joints allow 2.09 and 3.14, but 57 kg rest on
-torso 1: reversing it at full rate takes more than its 270 N m, and the torso folds."""
+"""Rate limits of the torso commands [rad/s]. The joints allow 2.09 and 3.14, but `torso_1` carries
+57 kg: reversing it at full rate takes more than its 270 N m, and the torso folds."""
 
 BASE_HEIGHT = -0.0006
-"""Height of the base frame at rest [m]: wheels and casters sink in by their compliance."""
+"""Height of the base frame at rest [m]; wheels and casters sink in by their compliance."""
 
 GRIPPER_OPEN = 0.05
-"""Opening of one finger [m]."""
+"""Position of one finger of an open gripper [m]."""
 
 
 def make_torso_dims() -> tuple[CommandDim, ...]:
-    """Return the torso's command entries, with the limits of the joint table."""
+    """Make the command entries of the torso, with the limits of the link table."""
     joints = {link.joint.name: link.joint for link in LINKS if link.joint is not None}
     dims = []
     for i, ready in enumerate(TORSO_READY):
@@ -69,12 +69,12 @@ def make_torso_dims() -> tuple[CommandDim, ...]:
 
 
 class RBY1(Morphology):
-    """RB-Y1 with the command space V1: base velocity and torso joints."""
+    """RB-Y1 A with the command base velocity and torso joint angles."""
 
     name = "rby1"
     command_space = CommandSpace(
         (
-            # name, key, unit, low, high, neutral, largest rate and change of rate
+            # name, key, unit, low, high, neutral, largest rate and acceleration
             CommandDim("v", "x.vel", "m/s", -1.2, 1.2, 0.0, 1.5, mobile_only=True, max_accel=50.0),
             CommandDim(
                 "yaw_rate",
@@ -116,7 +116,7 @@ class RBY1(Morphology):
                 Mode.MOBILE: PaperParameters(30, 10, 0.01, 10.0),
             }
         ),
-        # The left hand alone drives torso and left arm; the paper gives it no mode.
+        # The paper's Version 2: the left hand controls torso and left arm, in either mode.
         "v2": Variant(
             targets=("left_wrist",),
             body=(
@@ -131,37 +131,37 @@ class RBY1(Morphology):
     velocity_lag_s = 0.0
     pivot = PIVOT
     support = SUPPORT
-    # A servo at its limit may rest anywhere.
+    # A servo at its torque limit may rest anywhere in its range.
     largest_offset = 1.0
-    # Moving, its servos are behind by 0.05 rad, bending quickly by 0.2 for a moment; a torso that
-    # folds leaves 0.3 to 1.5 for good.
+    # In motion the servos lag by 0.05 rad, for a moment by 0.2 rad when bending quickly; a torso
+    # that folds keeps an error of 0.3 to 1.5 rad.
     servos = Servos(gap=0.15)
     posture_limits = POSTURE_LIMITS
     standing_reach = STANDING_REACH
-    # The wheels turn about -Y.
+    # The wheel joints turn about -Y, hence the negative coefficients.
     drive = WheelDrive(
         WHEEL_RADIUS, {"right_wheel": (-1, 0, -0.5 * TRACK), "left_wheel": (-1, 0, 0.5 * TRACK)}
     )
     driving = DRIVING
     point_heights, top_heights = (0.25, 1.5), (0.3, 1.3)
-    # Between the fingers of its hand is a gap, through which a toy would fall.
+    # An object would fall through the gap between the fingers: the hand needs a tray.
     work = Work(press=0.01, tray=True)
     hull_points = HULL
     hull_hands = ("left_palm", "right_palm")
     fall_height = -0.2
     fall_tilt = 0.35
     contact_kind = Wheels()
-    # Its servos follow within 10 ms: targets in steps would shake the hands.
+    # Its servos follow within 10 ms, so steps of the targets would shake the hands.
     ramps = True
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
-        """Build RB-Y1 alone."""
+        """Build RB-Y1 without a scene."""
         from xop_lerobot.morphology.rby1.model import build_rby1  # noqa: PLC0415
 
         return build_rby1(kind)
 
     def standing_qpos(self) -> np.ndarray:
-        """Stand at the ready pose with open grippers: free joint, then the joints. Shape (35,)."""
+        """Configuration at the ready pose, grippers open: free joint, then the joints. (35,)."""
         angles = dict(self.arm_rest)
         angles |= {f"torso_{i}": ready for i, ready in enumerate(TORSO_READY)}
         angles |= {f"gripper_finger_{side}1": -GRIPPER_OPEN for side in "lr"}

@@ -1,4 +1,4 @@
-"""RB-Y1 A v1.2: its numbers, as in the maker's URDF (rby1-sdk, Apache-2.0).
+"""Link table of RB-Y1 A v1.2, from the manufacturer's URDF (rby1-sdk, Apache-2.0).
 
 See docs/how_it_works/models.md.
 """
@@ -9,7 +9,7 @@ WHEEL_TORQUE = 60.0
 """Torque limit of a wheel [N m]; the URDF gives none."""
 
 PLACEHOLDER = 1000.0
-"""Effort that the URDF gives for the head [N m] and the fingers [N]: it never binds."""
+"""Placeholder effort of the URDF for head [N m] and fingers [N]; never reached."""
 
 LINKS = (
     Link(

@@ -1,4 +1,4 @@
-"""RB-Y1 as a MuJoCo model, put together from its tables."""
+"""MuJoCo model of RB-Y1, built from its tables; other bases with its upper body reuse it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ TIMESTEP = 0.005
 """Physics step [s]."""
 
 FULL_TORQUE_ERROR = 0.01
-"""Position error at which a torso or arm servo gives its rated torque [rad].
+"""Position error at which a torso or arm servo reaches its rated torque [rad].
 
 The stiffness of a joint is its effort over this error, so it sags by at most 0.01 rad under any
-weight that it can bear (4 mrad at the ready pose). MuJoCo's own gravity compensation is left
-off: it would push the weight of the torso and the arms against nothing, and the wheels would
-carry but half the robot, which could then lean any way without tipping.
+load that it can carry (4 mrad at the ready pose). MuJoCo's gravity compensation is not used: it is
+an external force without a reaction, so the wheels would carry only half the robot, which could
+then lean anywhere without tipping.
 """
 
 INERTIA = {
@@ -32,29 +32,29 @@ INERTIA = {
     "arm_0": 0.8, "arm_1": 0.5, "arm_2": 0.45, "arm_3": 0.4, "arm_4": 0.12, "arm_5": 0.13,
     "arm_6": 0.1,
 }  # fmt: skip
-"""Inertia that each joint moves at the ready pose, rotor included [kg m^2]: it sets the damping."""
+"""Inertia about each joint at the ready pose, including the rotor [kg m^2]; sets the damping."""
 
 ARMATURE = {"torso": 1.0, "arm": 0.1, "head": 0.05, "wheel": 0.2, "finger": 0.1}
-"""Reflected rotor inertia by kind of joint [kg m^2], of a finger [kg]; estimates."""
+"""Reflected rotor inertia by kind of joint [kg m^2], for fingers [kg]; estimates."""
 
 JOINT_DAMPING = 0.5
 """Viscous friction of torso, arms and head [N m s/rad]."""
 
 WHEEL_GAIN = 100.0
-"""Wheel torque per speed error [N m s/rad]: in a curve of 0.8 m/s and 0.8 rad/s, where the mass
-behind the axle pulls the robot straight, 2 % of the yaw rate is lost."""
+"""Wheel torque per speed error [N m s/rad]: in a curve at 0.8 m/s and 0.8 rad/s, where the mass
+behind the axle straightens the path, 2 % of the yaw rate is lost."""
 
 HEAD_GAINS = (200.0, 7.0)
 """k_p [N m/rad], k_d [N m s/rad]."""
 
 FINGER_GAINS = (1500.0, 60.0)
-"""k_p [N/m], k_d [N s/m]: 75 N when an opening of 5 cm is blocked shut."""
+"""k_p [N/m], k_d [N s/m]: 75 N when closing on an object of the full opening, 5 cm."""
 
 GRIPPERS = {
     "left_gripper": ("gripper_finger_l2", "gripper_finger_l1"),
     "right_gripper": ("gripper_finger_r2", "gripper_finger_r1"),
 }
-"""Motors of the hands: the finger that each drives, and the other one, which mirrors it."""
+"""Gripper motors: the finger joint that each drives, and the one that mirrors it."""
 
 
 def compute_gains(joint: Joint) -> tuple[float, float]:
@@ -71,7 +71,7 @@ def compute_gains(joint: Joint) -> tuple[float, float]:
 
 
 def build_rby1(kind: str) -> mujoco.MjSpec:
-    """Build RB-Y1 alone; see `build_on_base`."""
+    """Build RB-Y1 without a scene; see `build_on_base`."""
     return build_on_base("rby1", kind, LINKS, GRIPPERS, shapes.SHAPES, shapes.SITES, add_wheels)
 
 
@@ -85,25 +85,25 @@ def build_on_base(
     add_base: Callable[[mujoco.MjSpec], None],
     wrist_cameras: Sequence[Frame] = shapes.WRIST_CAMERAS,
 ) -> mujoco.MjSpec:
-    """Build a robot with the upper body of RB-Y1 on some base.
+    """Build a robot with the upper body of RB-Y1 on a given base, without a scene.
 
-    The planning model has what stands on the floor alone, no visuals, no cameras.
+    The planning model has only the contacts with the floor, no visuals and no cameras.
 
     Args:
         name: Name of the model.
         kind: ``"full"`` or ``"planning"``.
         links: Its links.
-        grippers: As `GRIPPERS`.
-        looks: What collides and is seen.
+        grippers: Gripper motors, as `GRIPPERS`.
+        looks: Shapes for collision and display.
         sites: Its named frames.
-        add_base: Adds what stands on the floor.
+        add_base: Adds the geoms, and motors if any, that act on the floor.
         wrist_cameras: The cameras of the hands.
     """
     import mujoco  # noqa: PLC0415
 
     planning = kind == "planning"
     spec = rows.new_spec(name, TIMESTEP)
-    # The servos' damping is taken implicitly, which keeps stiff joints stable at this step.
+    # Implicit integration of the servos' damping keeps the stiff joints stable at this step.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     rows.add_links(spec, links, "base_joint")
     joints = {link.joint.name: link.joint for link in links if link.joint is not None}
@@ -126,7 +126,7 @@ def build_on_base(
 
 
 def add_motor(spec: mujoco.MjSpec, row: Joint) -> None:
-    """Give a joint its armature, friction and motor; grippers come after all others."""
+    """Set armature, friction and motor of a joint; fingers get their motors in `add_grippers`."""
     import mujoco  # noqa: PLC0415
 
     joint = spec.joint(row.name)
@@ -148,7 +148,7 @@ def add_motor(spec: mujoco.MjSpec, row: Joint) -> None:
 def add_grippers(
     spec: mujoco.MjSpec, joints: Mapping[str, Joint], grippers: Mapping[str, tuple[str, str]]
 ) -> None:
-    """Add one motor a hand, whose target is the opening of one finger [m]."""
+    """Add one motor per hand, whose target is the position of one finger [m]."""
     import mujoco  # noqa: PLC0415
 
     for name, (driven, mirrored) in grippers.items():
@@ -164,7 +164,7 @@ def add_grippers(
 
 
 def add_wheels(spec: mujoco.MjSpec) -> None:
-    """Add what stands on the floor: a wheel touches in one point, a caster slides freely."""
+    """Add the contacts with the floor: wheels with point contact, frictionless casters."""
     import mujoco  # noqa: PLC0415
 
     floor_only = {"contype": 0, "conaffinity": FLOOR_BIT, "mass": 0, "priority": 1, "group": 3}

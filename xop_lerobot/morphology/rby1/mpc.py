@@ -1,4 +1,4 @@
-"""Parameters of the model predictive controller for RB-Y1."""
+"""Planner parameters of RB-Y1."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from xop_lerobot.morphology.effect import Acts, Effect
 from xop_lerobot.morphology.tuning import CostWeights, Driving, MpcConfig
 
 PIVOT = 0.228
-"""The wheels' axle is this far ahead of the base frame [m]."""
+"""Forward distance of the wheel axle from the base frame [m]."""
 
 SUPPORT = ((0.228, -0.265), (0.228, 0.265), (-0.275, 0.085), (-0.275, -0.085))
-"""Where the wheels and the casters touch the ground, in the base frame [m]."""
+"""Ground contacts of wheels and casters in the base frame [m]."""
 
 HULL = {
     "hull_front_left": 0.17,
@@ -25,12 +25,12 @@ HULL = {
     "left_palm": 0.1,
     "right_palm": 0.1,
 }
-"""Spheres about these cover the base (to 5 cm beyond its corners), head, elbows and hands [m]."""
+"""Radii of the hull spheres [m]; they cover base (5 cm beyond its corners), head, elbows, hands."""
 
 EFFECTS = (
     Effect(Acts.FORWARD),
     Effect(Acts.TURN),
-    # Leaning sideways (torso 0 and 4) costs stability, turning the chest (torso 5) does not.
+    # Leaning sideways (torso_0 and torso_4) costs stability, turning the chest (torso_5) does not.
     *(
         Effect(Acts.JOINT, f"torso_{i}", lag_s=0.1, effort=effort)
         for i, effort in enumerate((10.0, 4.0, 4.0, 4.0, 10.0, 1.0))
@@ -52,15 +52,14 @@ DRIVING = Driving(
     turning_twist=0.6,
     lean=0.1,
 )
-"""Braked more gently than the wheels could, for the height of what stands on them; the waist keeps
-clear of its joint's limit."""
+"""Gentler than the wheels allow, for the tall upper body; `waist` leaves a margin to the limit of
+its joint."""
 
 POSTURE_LIMITS = {"torso_2": (-math.inf, 0.0)}
-"""Its knees bend to the front. Bent to the back they take it to places that servos do not hold:
-the chest hangs far ahead, and folds."""
+"""Knees bend forward. Bent backward, the chest hangs far ahead and the servos cannot hold it."""
 
 STANDING_REACH = 0.3
-"""How far a standing robot's head is led from where it rests [m]; the torque may allow less."""
+"""Largest distance of a standing robot's head goal from rest [m]; torques may allow less."""
 
 TORSO_NOISE = {f"torso_{i}": 0.05 for i in range(6)}
 
@@ -73,7 +72,7 @@ CONFIGS = {
     ),
     Mode.MOBILE: MpcConfig(
         num_samples=16,
-        # Shorter ones do not see a torso collapse when the base turns at speed.
+        # A shorter horizon does not show that the torso collapses when the base turns at speed.
         horizon=14,
         noise_std={"v": 0.2, "yaw_rate": 0.3, **TORSO_NOISE},
         weights=CostWeights(orientation=0.1, tilt_share=2.0, lean=500.0, lateral=0.4),
@@ -84,19 +83,19 @@ CONFIGS = {
 V2_CONFIG = MpcConfig(
     num_samples=16,
     horizon=8,
-    # The arm reaches where it can; the torso, which carries it, goes on slowly.
+    # Less noise on the torso, which carries the arm: the arm does the fast corrections.
     noise_std={
         **{f"torso_{i}": 0.02 for i in range(6)},
         **{f"left_arm_{i}": 0.05 for i in range(7)},
     },
-    # Joints follow within 0.1 s: a goal further ahead would be overtaken.
+    # Joints follow within 0.1 s: a longer preview would make the hand overtake its goal.
     preview_s=0.1,
     proposal_s=0.3,
     candidates=("proposal", "paced", "previous", "stop"),
-    # A change that costs damps the wrist where two of its axes are in line.
+    # The cost of change damps the wrist near its singularity, where two of its axes align.
     weights=CostWeights(orientation=0.2, change=0.01, upright=3.0),
 )
-"""Torso and left arm after the left hand; the base stands in either mode."""
+"""Variant `v2`: torso and left arm follow the left hand; the base stands in either mode."""
 
 
 def mpc_config(mode: Mode) -> MpcConfig:

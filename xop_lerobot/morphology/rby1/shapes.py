@@ -1,4 +1,4 @@
-"""RB-Y1: the primitives that make its looks and its collisions, its cameras and named frames."""
+"""Shapes of RB-Y1 for display and collision, its cameras and named frames."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ TRACK = 0.53
 """Distance between the contact points of the wheels [m]."""
 
 CASTER_RADIUS = 0.03
-CASTERS = {"left_caster": (-0.275, 0.085, CASTER_RADIUS), "right_caster": (-0.275, -0.085, CASTER_RADIUS)}  # fmt: skip  # noqa: E501
-"""Centres of the spheres that stand for the casters, in the base [m]; they slide freely."""
+CASTERS = {"left_caster": (-0.275, 0.085, CASTER_RADIUS), "right_caster": (-0.275, -0.085,
+CASTER_RADIUS)}  # fmt: skip
+"""Centres of the spheres that represent the casters, in the base frame [m]; frictionless."""
 
 MATERIALS = {
     "shell": (0.90, 0.91, 0.92, 0.3),
@@ -24,7 +25,7 @@ MATERIALS = {
 """Red, green, blue, gloss."""
 
 ACROSS = (1.5708, 0, 0)
-"""Roll that lays a cylinder along Y [rad]."""
+"""Orientation of a cylinder along Y: roll, pitch, yaw [rad]."""
 
 BODY = (
     Shape("base", "box", (0.32, 0.235, 0.09), (-0.018, 0, 0.16), material="shell"),
@@ -86,7 +87,7 @@ LEFT = (
 
 
 def _finger(link: str) -> Shape:
-    """Return the pad of a finger; closed fingers meet in the middle."""
+    """Return the pad of a finger; the pads of a closed gripper touch in the middle."""
     return Shape(link, "box", (0.008, 0.012, 0.035), (0.005, 0, -0.035), material="dark", name=link)
 
 
@@ -109,7 +110,7 @@ EXCLUDED = (
     ("ee_finger_r1", "ee_finger_r2"),
     ("ee_finger_l1", "ee_finger_l2"),
 )  # fmt: skip
-"""Pairs of links whose shapes overlap by construction and never collide."""
+"""Pairs of links excluded from collision, since their shapes overlap by construction."""
 
 SITES = (
     Frame("head", "link_head_2", (0.05, 0, 0.06)),
@@ -132,7 +133,7 @@ SITES = (
 HEAD_CAMERA = Frame(
     "head", "link_head_2", (0.095, 0, 0.065), (0.8253, 0, -0.5646), (0.5646, 0, 0.8253)
 )
-"""The camera in the face, pitched down by 0.6 rad."""
+"""Camera in the face, pitched down by 0.6 rad."""
 
 HEAD_FOVY = 58.0
 """Vertical field of view of the head camera [deg]."""

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from xop_lerobot.morphology.tuning import MpcConfig
 
 BASE_HEIGHT = -0.00034
-"""Height of the base frame at rest [m]: wheels sink in by their compliance."""
+"""Height of the base frame at rest [m]; wheels sink in by their compliance."""
 
 
 class MecanumWheels(Wheels):
-    """Wheels whose rollers let them go to any side, and whose turning is no joint of the model.
+    """Wheels with rollers that move in any direction, and whose rotation is not a model joint.
 
-    So they tell nothing of the base's speed but that it stays level.
+    So they give no information on the base velocity, except that its vertical part is zero.
     """
 
     tells_speed = False
@@ -44,12 +44,12 @@ class MecanumWheels(Wheels):
 
 
 class RBY1M(RBY1):
-    """RB-Y1 M: what is said here differs from RB-Y1."""
+    """RB-Y1 M; attributes that are not set here are those of RB-Y1 A."""
 
     name = "rby1m"
     command_space = CommandSpace(
         (
-            # name, key, unit, low, high, neutral, largest rate and change of rate
+            # name, key, unit, low, high, neutral, largest rate and acceleration
             CommandDim("vx", "x.vel", "m/s", -1.0, 1.0, 0.0, 1.5, mobile_only=True, max_accel=50.0),
             CommandDim("vy", "y.vel", "m/s", -0.7, 0.7, 0.0, 1.5, mobile_only=True, max_accel=50.0),
             CommandDim(
@@ -87,16 +87,16 @@ class RBY1M(RBY1):
             "wheel_rl": (1, 1, -HALF_LENGTH - HALF_WIDTH),
         },
     )
-    driving = None
+    driving = None  # it can move sideways, so it needs no path
 
     def build_spec(self, kind: ModelKind) -> mujoco.MjSpec:
-        """Build RB-Y1 M alone."""
+        """Build RB-Y1 M without a scene."""
         from xop_lerobot.morphology.rby1m.model import build_rby1m  # noqa: PLC0415
 
         return build_rby1m(kind)
 
     def standing_qpos(self) -> np.ndarray:
-        """Stand at the ready pose with open grippers: free joint, then the joints. Shape (33,)."""
+        """Configuration at the ready pose, grippers open: free joint, then the joints. (33,)."""
         angles = dict(self.arm_rest)
         angles |= {f"torso_{i}": ready for i, ready in enumerate(TORSO_READY)}
         angles |= {f"gripper_finger_{side}1": GRIPPER_OPEN for side in "lr"}

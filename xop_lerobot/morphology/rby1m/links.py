@@ -11,7 +11,7 @@ from xop_lerobot.morphology.rby1.links import LINKS as RBY1_LINKS
 from xop_lerobot.morphology.rby1.links import PLACEHOLDER
 
 HALF_LENGTH, HALF_WIDTH, WHEEL_RADIUS = 0.245, 0.245, 0.076
-"""Distances of the wheels from their middle along X and Y, and their radius [m]."""
+"""Distances of the wheels from their common centre along X and Y, and their radius [m]."""
 
 BASE = (
     Link(
@@ -55,7 +55,7 @@ BASE = (
         inertia=(0.00471013, 0.00616468, 0.00470782, 2.5e-07, 0, 0),
     ),
 )
-"""Wheels turn in no joint of the model: their motors push the base (`model.py`)."""
+"""The wheels have no joints: their motors act on the base (`model.py`)."""
 
 CHANGED = (
     Link(
@@ -175,7 +175,7 @@ _OMITTED = ("base", "wheel_r", "wheel_l")
 
 
 def _change(link: Link) -> Link:
-    """The link of RB-Y1 M that stands where `link` of RB-Y1 A does."""
+    """Return the link of RB-Y1 M that replaces `link` of RB-Y1 A."""
     if link.name == "link_torso_0":
         return replace(link, pos=(0, 0, 0.2965))
     return _CHANGED.get(link.name, link)

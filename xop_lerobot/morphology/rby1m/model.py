@@ -1,14 +1,14 @@
-r"""RB-Y1 M as a MuJoCo model: the upper body of RB-Y1 A on four mecanum wheels.
+r"""MuJoCo model of RB-Y1 M: the upper body of RB-Y1 A on four mecanum wheels.
 
-The rollers are ideal: they roll without friction across their axis and never slip along it. So the
-motor of a wheel pushes the base where the wheel touches the ground, along the axis of the roller
-there, and turns as fast as that point moves along it:
+The rollers are ideal: they roll without friction perpendicular to their axis and never slip along
+it. So the motor of a wheel acts on the base at the wheel's ground contact, along the axis of the
+roller there, and its speed is that of the contact point along this axis:
 
 .. math:: r \omega_i = v_{x,i} + s_i v_{y,i}, \qquad F_i = \frac{\tau_i}{r} (1, s_i)
 
-with the velocity of the wheel's point in the base's axes and :math:`s_i = \pm 1` by the side on
-which the rollers are mounted. The wheel's own turning is no joint of the model, and contacts with
-the ground bear the weight alone.
+with the velocity of the contact point in the base's axes and :math:`s_i = \pm 1` by the mounting
+direction of the rollers. The rotation of a wheel is not a joint of the model, and the contacts
+with the ground only carry the weight.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ GRIPPERS = {
     "left_gripper": ("gripper_finger_l1", "gripper_finger_l2"),
     "right_gripper": ("gripper_finger_r1", "gripper_finger_r2"),
 }
-"""Motors of the hands: the finger that each drives, and the other one, which mirrors it."""
+"""Gripper motors: the finger joint that each drives, and the one that mirrors it."""
 
 ROLLERS = {"fr": 1.0, "fl": -1.0, "rr": -1.0, "rl": 1.0}
-"""Share s of the velocity to the left in the speed of each wheel [1]: the rollers on the ground
-make a diamond, those on top an X, as is usual."""
+"""Coefficient s of the lateral velocity in the speed of each wheel [1]: seen from above, the upper
+rollers form an X and those on the ground a diamond, the usual mounting."""
 
 WHEEL_GAIN = 60.0
 """Torque per speed error of a wheel [N m s/rad]."""
 
 WHEEL_TORQUE = 24.0
-"""Torque limit of a wheel [N m]; the URDF gives none. It pushes with 316 N along the floor, about
-what a wheel that bears a quarter of 164 kg grips with."""
+"""Torque limit of a wheel [N m]; the URDF gives none. That is 316 N along the floor, about the
+traction of a wheel that carries a quarter of 164 kg."""
 
 WHEEL_SPEED = 31.4
 """Speed limit of a wheel [rad/s]; the URDF gives none."""
 
 
 def build_rby1m(kind: str) -> mujoco.MjSpec:
-    """Build RB-Y1 M alone; see `build_on_base`."""
+    """Build RB-Y1 M without a scene; see `build_on_base`."""
     return build_on_base(
         "rby1m",
         kind,
@@ -59,7 +59,7 @@ def build_rby1m(kind: str) -> mujoco.MjSpec:
 
 
 def add_wheels(spec: mujoco.MjSpec) -> None:
-    """Add what bears the weight on each wheel, and its motor."""
+    """Add the frictionless ground contact of each wheel, and its motor."""
     import mujoco  # noqa: PLC0415
 
     for name, wheel in shapes.WHEELS.items():

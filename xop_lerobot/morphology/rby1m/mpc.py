@@ -1,4 +1,4 @@
-"""Parameters of the model predictive controller for RB-Y1 M."""
+"""Planner parameters of RB-Y1 M."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from xop_lerobot.morphology.rby1 import mpc as rby1
 from xop_lerobot.morphology.tuning import CostWeights, MpcConfig
 
 PIVOT = -0.002
-"""The middle of the wheels is this far ahead of the base frame [m]."""
+"""Forward distance of the wheels' common centre from the base frame [m]."""
 
 SUPPORT = ((0.243, -0.245), (0.243, 0.245), (-0.247, 0.245), (-0.247, -0.245))
-"""Where the wheels touch the ground, in the base frame [m]."""
+"""Ground contacts of the wheels in the base frame [m]."""
 
 EFFECTS = (
     Effect(Acts.FORWARD),
@@ -26,7 +26,7 @@ CONFIGS = {
         num_samples=16,
         horizon=14,
         noise_std={"vx": 0.2, "vy": 0.2, "yaw_rate": 0.3, **rby1.TORSO_NOISE},
-        # Whatever the goal, the base can turn to it on the spot: heading counts as much as place.
+        # The base can turn on the spot to any goal, so heading counts as much as position.
         weights=CostWeights(orientation=1.0, tilt_share=0.3, lean=50.0),
         reach=0.4,
     ),

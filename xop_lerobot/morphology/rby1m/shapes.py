@@ -1,4 +1,4 @@
-"""RB-Y1 M: the primitives that differ from RB-Y1 A's, and its named frames."""
+"""Shapes of RB-Y1 M that differ from those of RB-Y1 A, its wrist cameras and named frames."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from xop_lerobot.morphology.rby1.shapes import SITES as RBY1_SITES
 from xop_lerobot.morphology.rby1m.links import WHEEL_RADIUS
 
 WHEELS = {"front_right": "fr", "front_left": "fl", "rear_right": "rr", "rear_left": "rl"}
-"""Wheels, and how the links and motors call them."""
+"""Names of the wheels, and their abbreviations in the names of links and motors."""
 
 BASE = (
     Shape("base", "box", (0.3, 0.205, 0.09), (-0.002, 0, 0.16), material="shell"),
@@ -36,7 +36,7 @@ LEFT = (
 )  # fmt: skip
 
 FINGERS = tuple(
-    # The fingers' frames are in the flange; the pads are where those of RB-Y1 A are.
+    # The finger frames are at the flange; the offset puts the pads where RB-Y1 A has them.
     Shape(name, "box", (0.008, 0.012, 0.035), (0.008, 0, -0.11), material="dark", name=name)
     for name in ("ee_finger_r1", "ee_finger_r2", "ee_finger_l1", "ee_finger_l2")
 )
@@ -45,7 +45,7 @@ WRIST_CAMERAS = tuple(
     Frame(f"{side}_wrist", f"ee_{side}", (0.15, 0, 0.06), (-0.62, 0, -0.78), (1, 0, 0))
     for side in ("left", "right")
 )
-"""Above the hand, whose fingers open to the sides, looking at them."""
+"""Above the hand, looking at the fingers, which open sideways."""
 
 _OWN = (*BASE, *LEFT, *(mirror(shape) for shape in LEFT), *FINGERS)
 _REPLACED = {"wheel_l", "wheel_r", *(shape.link for shape in _OWN)}
@@ -62,4 +62,4 @@ SITES = (
     *(Frame(f"{name}_wheel_center", f"wheel_{w}_link", (0, 0, 0)) for name, w in WHEELS.items()),
     *(Frame(f"wheel_{w}", f"wheel_{w}_link", (0, 0, -WHEEL_RADIUS)) for w in WHEELS.values()),
 )
-"""Those on the body are RB-Y1 A's; `wheel_*` are where the wheels touch the ground."""
+"""Sites of the upper body are those of RB-Y1 A; `wheel_*` are the ground contacts."""
