@@ -280,7 +280,7 @@ def test_rates_and_delays_are_whole_steps(noise: NoiseConfig, text: str) -> None
             "the policy's period of 0.02 s is not a whole multiple of the physics step of 0.006 s",
         ),
         ({"time_step": 0}, "the physics step must be a positive number of seconds, got 0"),
-        ({"width": 0}, "a picture must be at least 1 x 1 pixels, got 0 x 240"),
+        ({"width": 0}, "an image must be at least 1 x 1 pixels, got 0 x 240"),
         ({"seed": -1}, "seed must be 0 or more, got -1"),
     ],
 )

@@ -548,7 +548,7 @@ def test_without_opengl_the_error_names_the_package(monkeypatch: pytest.MonkeyPa
     with pytest.raises(RenderingUnavailable) as error:
         make_gl_context(320, 240)
     assert str(error.value) == (
-        "pictures can't be rendered on this machine (egl: libEGL is not installed; "
+        "images can't be rendered on this machine (egl: libEGL is not installed; "
         "osmesa: libOSMesa is not installed). Install Mesa's EGL: "
         "'apt-get install libegl1 libgl1-mesa-dri' (Debian, Ubuntu), "
         "'dnf install mesa-libEGL mesa-dri-drivers' (Fedora), or run without cameras."

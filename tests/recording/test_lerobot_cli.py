@@ -247,7 +247,7 @@ def test_an_unknown_flag_names_it(tmp_path, monkeypatch, capsys):
 BAD_FLAGS = {
     "--robot.fps=30": "robot.fps must divide the low-level policy's 50 Hz, got 30",
     "--robot.sim.noise=loud": "unknown noise preset 'loud'. Known: harsh, mild, off",
-    "--robot.width=0": "a picture must be at least 1 x 1 pixels, got 0 x 48",
+    "--robot.width=0": "an image must be at least 1 x 1 pixels, got 0 x 48",
     "--teleop.device.hold_s=-1": "device.hold_s must be finite and at least 0, got -1.0",
     "--teleop.device.mode=fly": "unknown device.mode 'fly'. Known: mobile, stationary",
     "--teleop.retargeter.preset=fast": (

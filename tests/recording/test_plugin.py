@@ -157,7 +157,7 @@ BAD_CONFIGS = {
         {"sim": SceneConfig(noise="loud")},
         "unknown noise preset 'loud'. Known: harsh, mild, off",
     ),
-    "size": ({"width": 0}, "a picture must be at least 1 x 1 pixels, got 0 x 240"),
+    "size": ({"width": 0}, "an image must be at least 1 x 1 pixels, got 0 x 240"),
     "seed": ({"seed": -1}, "seed must be 0 or more, got -1"),
 }
 

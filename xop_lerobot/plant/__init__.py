@@ -1,1 +1,1 @@
-"""The body behind one interface: simulated now, real robots later."""
+"""Plants: the robot's body behind one interface, at present simulated ones."""

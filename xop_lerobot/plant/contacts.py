@@ -1,4 +1,4 @@
-"""Which contacts of a robot are none of its standing: obstacles, itself, or the ground by hand."""
+"""Classification of a robot's contacts: support on the ground, or collision with anything else."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
 
 STANDING_GAP = 0.005
-"""A part of the robot this close to the ground when it stands is meant to touch it [m]."""
+"""Distance to the ground in the standing posture up to which a geom counts as support [m]."""
 
 _OTHER, _FLOOR, _SUPPORT, _ROBOT = range(4)
 
 
 class ContactTable:
-    """Tells a collision from the ground under feet, wheels and casters.
+    """Distinguishes collisions from the support of feet, wheels and casters on the ground.
 
     Every geom is floor (a static plane or height field), support (a robot's geom that may touch
-    the floor), robot, or anything else. A contact of the robot is a collision unless it is
-    support on floor. A support is what touches the floor at the standing posture, and every geom
-    of a body that carries a contact point (a foot may roll onto its edge).
+    the floor), robot, or other. A contact of the robot is a collision unless it is support on
+    floor. Support geoms are those that touch the floor in the standing posture, and all geoms of
+    bodies with a contact point, since a foot may roll onto its edge.
 
     Args:
         model: Model with the robot in it.
@@ -46,7 +46,7 @@ class ContactTable:
         kind[is_robot & np.isin(model.geom_bodyid, list(feet))] = _SUPPORT
         kind[list(_find_standing_geoms(model, morphology, is_robot, is_floor))] = _SUPPORT
         self._kind = kind
-        # Entry (i, j): is a contact of kind i with kind j a collision of the robot?
+        # Entry (i, j): whether a contact of kind i with kind j is a collision of the robot.
         table = np.zeros((4, 4), dtype=bool)
         table[_SUPPORT:, :] = table[:, _SUPPORT:] = True
         table[_SUPPORT, _FLOOR] = table[_FLOOR, _SUPPORT] = False
@@ -54,10 +54,10 @@ class ContactTable:
         self._names = [_describe(model, geom) for geom in range(model.ngeom)]
 
     def find_collisions(self, data: mujoco.MjData) -> set[tuple[str, str]]:
-        """Names of the bodies in every collision of the robot, the floor by its geom's name."""
+        """Pairs of names of the colliding bodies, the robot's first; static geoms by geom name."""
         if data.ncon == 0:
             return set()
-        pairs = data.contact.geom  # (ncon, 2), -1 for a flex
+        pairs = data.contact.geom  # (ncon, 2), -1 for a flex (deformable)
         rigid = (pairs >= 0).all(axis=1) & (data.contact.dist <= 0)
         kinds = self._kind[pairs]
         hits = pairs[rigid & self._is_collision[kinds[:, 0], kinds[:, 1]]]
@@ -79,7 +79,7 @@ def _describe(model: mujoco.MjModel, geom: int) -> str:
 def _find_standing_geoms(
     model: mujoco.MjModel, morphology: Morphology, is_robot: np.ndarray, is_floor: np.ndarray
 ) -> Iterable[int]:
-    """Yield the robot's geoms that reach the floor when it stands."""
+    """Yield the robot's geoms that touch the floor in the standing posture."""
     data = mujoco.MjData(model)
     standing = morphology.standing_qpos()
     data.qpos[: standing.size] = standing

@@ -1,4 +1,4 @@
-"""The objects of a scene that move freely, by name."""
+"""Movable objects of a scene, by name."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SceneObjects:
         return data.qpos[address : address + 7].copy()
 
     def set_pose(self, data: mujoco.MjData, name: str, pose: np.ndarray) -> None:
-        """Put `name` at rest at `pose`, x y z qw qx qy qz. Shape (7,).
+        """Place `name` at rest at `pose`, x y z qw qx qy qz. Shape (7,).
 
         Raises:
             UnknownName: Listing the objects.

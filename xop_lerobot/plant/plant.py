@@ -1,4 +1,4 @@
-"""The interface of a body: simulated or real, it is measured, commanded and stepped alike."""
+"""Interface of a plant, the robot's body: measured, commanded and stepped, simulated or real."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a plant's sensors say, and in simulation the truth beside it.
+    """Sensor readings of a plant, with the true state in simulation.
 
     Attributes:
         time: Clock of the plant [s].
@@ -25,7 +25,7 @@ class Measurement:
         true_qvel: The simulator's own velocity; `qvel` on hardware. Shape (nv,).
         fallen: Whether the robot has fallen.
         collision: Whether the robot touches anything but the ground under its feet or wheels.
-        contacts: Names of what touches what, for messages.
+        contacts: Names of the bodies in each collision, for messages.
     """
 
     time: float
@@ -40,41 +40,41 @@ class Measurement:
 
 
 class Plant(ABC):
-    """A body. `apply` sets the actuators' targets, `step` lets time pass."""
+    """A robot's body. `apply` sets the actuators' targets, `step` advances time."""
 
     @abstractmethod
     def reset(self, seed: int | None = None) -> None:
-        """Put the body at rest in its start posture; hardware moves there slowly."""
+        """Move to the initial posture, at rest; hardware moves there slowly."""
 
     @abstractmethod
     def measure(self) -> Measurement:
-        """Read the sensors now."""
+        """Read the sensors."""
 
     @abstractmethod
     def apply(self, targets: np.ndarray) -> None:
         """Set the target of every actuator, in the model's order. Shape (nu,)."""
 
     def ramp(self, targets: np.ndarray) -> None:
-        """Go to the targets of all actuators in a straight line, within the next `step`.
+        """Interpolate linearly to the targets of all actuators during the next `step`.
 
-        Like `apply` for a body that cannot, or whose own controller does it.
+        Same as `apply` for a body that cannot, or whose own controller interpolates.
         """
         self.apply(targets)
 
     def adapt(self, policy: LowLevelPolicy) -> None:
-        """Take the motors that `policy` was trained with; `PolicyLoop` asks for it.
+        """Adopt the motor gains that `policy` was trained with; called by `PolicyLoop`.
 
-        Nothing by default: a body of metal has the motors that it has.
+        No effect by default: real motors cannot be exchanged.
         """
         del policy
 
     @abstractmethod
     def step(self, dt: float) -> None:
-        """Let `dt` [s] pass: simulate it, or wait for it on hardware."""
+        """Advance by `dt` [s]: simulate, or wait on hardware."""
 
     @abstractmethod
     def render(self, camera: str) -> np.ndarray:
-        """Picture of `camera`. Shape (height, width, 3), uint8.
+        """Image of `camera`. Shape (height, width, 3), uint8.
 
         Raises:
             UnknownName: Listing the cameras.

@@ -1,4 +1,4 @@
-"""The robot as LeRobot sees it: a low-level policy that closes the loop around a plant."""
+"""Lock-step control loop of a robot: a low-level policy that closes the loop around a plant."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.plant.plant import Measurement, Plant
 from xop_lerobot.plant.watch import Watch
 
-# Measured speed of the base under which a robot stands still [m/s]: five standard deviations of
-# the noise of one axis in the mild preset, so that a standing robot is seen to stand.
+# Measured base speed below which a robot is stationary [m/s]: five standard deviations of the noise
+# per axis of the mild preset, so that noise does not make a standing robot seem to move.
 _SETTLED_SPEED = 0.15
 
 
 class PolicyLoop:
-    """Runs the policy at 50 Hz in lock-step: time passes only inside `execute`.
+    """Runs the policy at 50 Hz in lock-step: time advances only in `execute` and `advance`.
 
     Args:
         morphology: The robot.
-        plant: Its body; it takes the motors that the policy was trained with.
+        plant: Its body; it adopts the motors that the policy was trained with.
         policy: Its low-level policy.
 
     Attributes:
-        action: What is being executed.
+        action: The action being executed.
     """
 
     def __init__(self, morphology: Morphology, plant: Plant, policy: LowLevelPolicy) -> None:
@@ -38,16 +38,16 @@ class PolicyLoop:
         plant.adapt(policy)
         self._memory = policy.initial_memory(1)
         self.action = round_action(morphology.rest_action())
-        self._previous: RobotAction | None = None  # executed before, while one is executed
+        self._previous: RobotAction | None = None  # action before the present one, in `execute`
         self._measurement: Measurement | None = None
         self._collision = self._was_read = False
         self._watch = Watch(morphology)
 
     @property
     def state(self) -> RobotState:
-        """The robot now, as measured; the same value until time passes.
+        """Measured state of the robot; the same value until time advances.
 
-        A touch since the state was read last counts as a collision, however short it was.
+        Any contact since the state was last read counts as a collision, however short.
         """
         if self._measurement is None:
             self._measurement = self.plant.measure()
@@ -74,12 +74,12 @@ class PolicyLoop:
     def reset(
         self, seed: int | None = None, settle_s: float = 1.0, start: RobotAction | None = None
     ) -> None:
-        """Put the robot at rest and let the policy settle it for `settle_s` [s].
+        """Reset the plant, and let the policy settle for `settle_s` [s].
 
         Args:
             seed: Seed of the plant.
-            settle_s: For how long it settles [s].
-            start: What it executes meanwhile; by default it stands at rest.
+            settle_s: Time to settle [s].
+            start: Action to execute meanwhile; by default the action at rest.
         """
         self.plant.reset(seed)
         self._memory = self.policy.initial_memory(1)
@@ -90,7 +90,7 @@ class PolicyLoop:
         self._collision = self._was_read = False
 
     def execute(self, action: RobotAction, dt: float) -> RobotAction:
-        """Limit `action`, execute it for `dt` [s], and return what was executed.
+        """Limit `action`, execute it for `dt` [s], and return the executed action.
 
         Raises:
             BadValue: If `dt` is not a whole multiple of the policy's period.
@@ -104,11 +104,11 @@ class PolicyLoop:
         return self.action
 
     def limit(self, action: RobotAction, dt: float) -> RobotAction:
-        """What of `action` is executed within `dt` [s], after what is being executed now."""
+        """Limit `action` to what can be executed within `dt` [s] after the present action."""
         return limit_action(self.morphology, action, self.action, dt, self.policy.arm_limits)
 
     def advance(self, dt: float) -> None:
-        """Let `dt` [s] pass under the present action.
+        """Advance by `dt` [s] under the present action.
 
         Raises:
             BadValue: If `dt` is not a whole multiple of the policy's period.
@@ -118,13 +118,13 @@ class PolicyLoop:
             raise BadValue(
                 f"dt = {dt} s is not a whole multiple of the policy period {POLICY_DT} s"
             )
-        if self._was_read:  # else nobody has seen yet what was touched before
+        if self._was_read:  # earlier contacts have been reported; otherwise keep them
             self._collision = self._was_read = False
         for i in range(steps):
             self._run_policy(self._find_action((i + 1) / steps))
 
     def _find_action(self, share: float) -> RobotAction:
-        """What is executed in a period that ends after `share` of an action's time."""
+        """Interpolated action of the period that ends at the fraction `share` of its duration."""
         action, previous = self.action, self._previous
         if not self.morphology.ramps or previous is None or previous.mode is not action.mode:
             return action
@@ -135,7 +135,7 @@ class PolicyLoop:
         )
 
     def _run_policy(self, action: RobotAction) -> None:
-        """One period of the policy: measure, act, let 20 ms pass."""
+        """Run one period of the policy: measure, act, advance by 20 ms."""
         measured = self._measurement or self.plant.measure()
         targets, self._memory = self.policy.act(
             measured.qpos[None],

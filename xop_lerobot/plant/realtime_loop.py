@@ -1,4 +1,4 @@
-"""The policy loop on the wall clock, in a thread of its own."""
+"""Real-time control loop: the policy loop on the wall clock, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from xop_lerobot.plant.policy_loop import PolicyLoop
 
 logger = logging.getLogger(__name__)
 
-_WATCHDOG_S = 0.5  # without a new action for so long the robot stops
-_MAX_LAG_S = 0.2  # further behind the wall clock the loop gives the lost time up
+_WATCHDOG_S = 0.5  # time without a new action after which the robot stops
+_MAX_LAG_S = 0.2  # lag behind the wall clock beyond which the lost time is not caught up
 
 
 class RealtimeLoop:
     """Runs a `PolicyLoop` at 50 Hz against the wall clock.
 
-    `execute` hands over the newest action and returns at once; the policy never waits for the
-    caller. If no action comes for half a second, the robot stops where it is and holds its
-    posture. If the machine is too slow, simulated time falls behind and `late_ticks` counts it.
+    `execute` sets the newest action and returns at once; the policy never waits for the caller. If
+    no action arrives for half a second, the robot stops in place and holds its posture. If the
+    machine is too slow, simulated time falls behind, which `late_ticks` counts.
 
     Args:
         morphology: The robot.
-        plant: Its body; it must allow `measure` and `render` beside `step`.
+        plant: Its body; `measure` and `render` must be allowed concurrently with `step`.
         policy: Its low-level policy.
     """
 
@@ -42,17 +42,17 @@ class RealtimeLoop:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._handed_over = 0.0
-        self._resting: np.ndarray | None = None  # where the watchdog brings the command
+        self._resting: np.ndarray | None = None  # target command of the watchdog
         self._failure: BaseException | None = None
         self.late_ticks = 0
-        """Policy periods that began more than one period late."""
+        """Number of policy periods that began more than one period late."""
 
     @property
     def state(self) -> RobotState:
-        """The robot now, as measured.
+        """Measured state of the robot.
 
         Raises:
-            Exception: Whatever ended the loop's thread.
+            Exception: The exception that ended the loop's thread, if any.
         """
         with self._lock:
             self._check()
@@ -61,9 +61,9 @@ class RealtimeLoop:
     def reset(
         self, seed: int | None = None, settle_s: float = 1.0, start: RobotAction | None = None
     ) -> None:
-        """Put the robot at rest, let it settle (faster than the clock), then run.
+        """Reset the plant, let it settle (faster than the wall clock), then start the thread.
 
-        A failure of the loop's thread is forgotten.
+        Clears a failure of the loop's thread.
         """
         self._halt()
         self._failure = None
@@ -74,10 +74,10 @@ class RealtimeLoop:
         self._thread.start()
 
     def execute(self, action: RobotAction, dt: float) -> RobotAction:
-        """Limit `action`, hand it over, and return what will be executed from now on.
+        """Limit `action`, set it, and return the action that is executed from now on.
 
         Raises:
-            Exception: Whatever ended the loop's thread.
+            Exception: The exception that ended the loop's thread, if any.
         """
         with self._lock:
             self._check()
@@ -92,7 +92,7 @@ class RealtimeLoop:
         self._loop.close()
 
     def _check(self) -> None:
-        """Raise what ended the loop's thread."""
+        """Raise the exception that ended the loop's thread, if any."""
         if self._failure is not None:
             raise self._failure
 
@@ -105,7 +105,7 @@ class RealtimeLoop:
     def _run(self) -> None:
         try:
             self._run_until_stopped()
-        except BaseException as failure:  # raised in the caller
+        except BaseException as failure:  # raised again in the caller by `_check`
             self._failure = failure
             logger.exception("the policy loop has ended")
 
@@ -123,13 +123,13 @@ class RealtimeLoop:
             self.late_ticks += ahead < -POLICY_DT
             if ahead < -_MAX_LAG_S:
                 due = time.monotonic()
-            time.sleep(0)  # a loop that is always late must still let `execute` have the lock
+            time.sleep(0)  # a loop that is always late must still yield the lock to `execute`
 
     def _guard(self) -> None:
-        """Stop the robot when nobody has commanded it for too long.
+        """Watchdog: stop the robot if no action has been set for too long.
 
-        It is told to stand once its velocities have stopped: whoever takes it over on the way
-        would else take what is left of them for the sway of a standing robot.
+        The mode becomes stationary only once the velocities are zero. Otherwise a caller that
+        resumes meanwhile would take the remaining velocities for a weight shift.
         """
         if time.monotonic() - self._handed_over < _WATCHDOG_S:
             return

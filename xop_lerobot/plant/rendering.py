@@ -1,4 +1,4 @@
-"""Pictures of a simulation, by OpenGL in software where there is no graphics card."""
+"""Offscreen rendering of camera images with OpenGL, in software if there is no graphics card."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _HELP = (
 
 
 class RenderingUnavailable(XopError, RuntimeError):
-    """No OpenGL for pictures; the message says what was tried and which package to install."""
+    """No OpenGL for rendering; the message lists the failed backends and a package to install."""
 
     def __init__(self, faults: dict[str, str]) -> None:
         tried = "; ".join(f"{name}: {fault}" for name, fault in faults.items())
-        super().__init__(f"pictures can't be rendered on this machine ({tried}). {_HELP}")
+        super().__init__(f"images can't be rendered on this machine ({tried}). {_HELP}")
 
 
 class GlContext(Protocol):
-    """What every context of MuJoCo's offers."""
+    """Interface of MuJoCo's OpenGL contexts."""
 
     def make_current(self) -> None:
         """Bind the context to this thread."""
@@ -47,9 +47,9 @@ class GlContext(Protocol):
 def choose_backends() -> list[str]:
     """Names of the backends to try, best first.
 
-    `MUJOCO_GL` decides where it is set. Otherwise EGL comes first on Linux, with a display or
-    without: it needs no window and works in any thread. `import mujoco` reads the variable too,
-    but only for its own renderer, so it may be imported before or after.
+    `MUJOCO_GL` takes precedence. Otherwise EGL comes first on Linux, with or without a display: it
+    needs no window and works in any thread. `import mujoco` reads the variable too, but only for
+    its own renderer, so the order of imports does not matter.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted in _OFF:
@@ -69,14 +69,14 @@ def has_display() -> bool:
 
 
 def make_gl_context(width: int, height: int) -> GlContext:
-    """Make an offscreen context; it belongs to the thread that makes it.
+    """Make an offscreen context, which belongs to the calling thread.
 
     Args:
-        width: Largest width that will be rendered [pixel].
-        height: Largest height that will be rendered [pixel].
+        width: Largest width to render [pixel].
+        height: Largest height to render [pixel].
 
     Raises:
-        RenderingUnavailable: If no backend works; carries the fault of each.
+        RenderingUnavailable: If no backend works; names the fault of each.
     """
     faults: dict[str, str] = {}
     for name in choose_backends():
@@ -85,46 +85,46 @@ def make_gl_context(width: int, height: int) -> GlContext:
             faults[name] = f"lib{library} is not installed"
             continue
         try:
-            # PyOpenGL keeps to the platform of its first import, so a later one can't succeed
-            # after an earlier one was imported and failed; its fault then says so.
+            # PyOpenGL keeps the platform of its first import, so a later backend can't succeed
+            # after an earlier one was imported and failed; its error then says so.
             context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
             context.make_current()
-        except Exception as fault:  # each library has its own errors
+        except Exception as fault:  # each library raises its own exceptions
             faults[name] = str(fault) or type(fault).__name__
             continue
         return context
     raise RenderingUnavailable(faults or {"MUJOCO_GL": "rendering is switched off"})
 
 
-MAX_GEOMS = 2000
+MAX_GEOMS = 2000  # least capacity of the visual scene
 _COSTLY = (
     mujoco.mjtRndFlag.mjRND_SHADOW,
     mujoco.mjtRndFlag.mjRND_REFLECTION,
     mujoco.mjtRndFlag.mjRND_FOG,
     mujoco.mjtRndFlag.mjRND_HAZE,
 )
-"""Effects that cost a software renderer more than all else, and teach a policy nothing."""
+"""Effects that dominate the time of a software renderer and are of no use to a policy."""
 
 
 class Cameras:
     """The cameras of a model.
 
-    An OpenGL context belongs to one thread, so each thread that asks for a picture gets its own
-    renderer, made at its first picture. The picture is computed from a copy of the position:
-    rendering never writes to the physics, and a seed gives the same run with cameras or without.
+    An OpenGL context belongs to one thread, so each thread gets its own renderer at its first
+    image. Images are computed from a copy of the positions: rendering never writes to the physics,
+    so a seed gives the same run with or without cameras.
 
     Args:
         model: Model with named cameras.
-        width: Width of a picture [pixel].
-        height: Height of a picture [pixel].
+        width: Width of an image [pixel].
+        height: Height of an image [pixel].
     """
 
     def __init__(self, model: mujoco.MjModel, width: int = 320, height: int = 240) -> None:
         self._model = model
         self.width, self.height = width, height
         self.names = tuple(model.cam(i).name or f"camera {i}" for i in range(model.ncam))
-        # The context takes both from the model: its buffer must hold the picture, and smoothing
-        # edges by four samples a pixel costs four times the work of a software renderer.
+        # The context takes these from the model: its buffer must hold the image, and antialiasing
+        # with four samples per pixel costs a software renderer four times the work.
         visual = model.vis
         visual.global_.offwidth = max(visual.global_.offwidth, width)
         visual.global_.offheight = max(visual.global_.offheight, height)
@@ -144,19 +144,19 @@ class Cameras:
     def render(
         self, camera: str, data: mujoco.MjData, lock: AbstractContextManager[object] | None = None
     ) -> np.ndarray:
-        """Render what `camera` sees of the positions in `data`, which is only read.
+        """Render the positions in `data` from `camera`; `data` is only read.
 
         Args:
             camera: Name of the camera.
-            data: Physics to look at.
-            lock: Held while the positions are copied, where another thread steps them.
+            data: Physics state.
+            lock: Held while the positions are copied, if another thread steps the physics.
 
         Returns:
-            Fresh picture. Shape (height, width, 3), uint8.
+            New image. Shape (height, width, 3), uint8.
 
         Raises:
             UnknownName: Listing the cameras.
-            RenderingUnavailable: If this machine has no OpenGL for it.
+            RenderingUnavailable: If this machine has no working OpenGL.
         """
         index = self.check_camera(camera)
         renderer: _Renderer | None = getattr(self._threads, "renderer", None)
@@ -168,7 +168,7 @@ class Cameras:
         return renderer.render(index)
 
     def close(self) -> None:
-        """Release this thread's renderer; those of other threads go when their threads end."""
+        """Release this thread's renderer; those of other threads are released as they end."""
         renderer: _Renderer | None = getattr(self._threads, "renderer", None)
         if renderer is not None:
             del self._threads.renderer
@@ -196,13 +196,13 @@ class _Renderer:
         self._rect = mujoco.MjrRect(0, 0, width, height)
 
     def copy_positions(self, data: mujoco.MjData) -> None:
-        """Take over all that positions follow from."""
+        """Copy the quantities that determine all positions."""
         self._data.qpos[:] = data.qpos
         self._data.mocap_pos[:] = data.mocap_pos
         self._data.mocap_quat[:] = data.mocap_quat
 
     def render(self, camera: int) -> np.ndarray:
-        """Picture of the positions copied last. Shape (height, width, 3), uint8."""
+        """Render the positions copied last. Shape (height, width, 3), uint8."""
         if self._gl is None:
             raise RuntimeError("the renderer is closed")
         self._gl.make_current()
@@ -221,9 +221,9 @@ class _Renderer:
             self._scene,
         )
         mujoco.mjr_render(self._rect, self._scene, self._context)
-        picture = np.empty((self._rect.height, self._rect.width, 3), dtype=np.uint8)
-        mujoco.mjr_readPixels(picture, None, self._rect, self._context)
-        return np.ascontiguousarray(picture[::-1])  # OpenGL counts rows from the bottom
+        image = np.empty((self._rect.height, self._rect.width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(image, None, self._rect, self._context)
+        return np.ascontiguousarray(image[::-1])  # OpenGL counts rows from the bottom
 
     def close(self) -> None:
         """Release the context; may be called twice."""
@@ -234,7 +234,7 @@ class _Renderer:
             self._gl = None
 
     def __del__(self) -> None:
-        """Release the context in the thread that ends with it."""
+        """Release the context when its thread ends."""
         with suppress(Exception):
             self.close()
 
@@ -244,14 +244,14 @@ _LIVING: weakref.WeakSet[_Renderer] = weakref.WeakSet()
 
 @functools.cache
 def _close_all_at_exit() -> None:
-    """Release what is left before the OpenGL library's own end, which would take it along.
+    """Register the release of all contexts before the exit handler of the OpenGL library.
 
-    Called once a context exists: exit handlers run last registered first.
+    Called once a context exists, since exit handlers run in reverse order of registration.
     """
     atexit.register(_close_all)
 
 
 def _close_all() -> None:
     for renderer in list(_LIVING):
-        with suppress(Exception):  # one may be bound to a thread that still runs
+        with suppress(Exception):  # it may be bound to a thread that is still running
             renderer.close()

@@ -1,4 +1,4 @@
-"""Sensors of the simulated plant: white noise, walking bias, rate, delay and lost samples."""
+"""Simulated sensors: white noise, random-walk bias, sampling rate, delay and dropouts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SLIDE_SCALE = 0.1
 
 
 class Sample(NamedTuple):
-    """The true state when a sensor looked, and how it erred."""
+    """True state at the time of a sample, and the error of the sensor."""
 
     qpos: np.ndarray
     """True position. Shape (nq,)."""
@@ -31,14 +31,14 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorModel:
-    """How one sensor errs.
+    """Error model of one sensor.
 
     Attributes:
-        white: Standard deviation of the noise of a sample. Shape (size,).
+        white: Standard deviation of the white noise per sample. Shape (size,).
         walk: Standard deviation of the bias after one second. Shape (size,).
         offset: Standard deviation of the bias at reset. Shape (size,).
-        period: Physics steps from sample to sample.
-        delay: Physics steps until a sample arrives.
+        period: Sampling period [physics steps].
+        delay: Delay of a sample [physics steps].
         dropout: Probability that a sample is lost.
         time_step: Physics step [s].
     """
@@ -53,11 +53,11 @@ class SensorModel:
 
 
 class Sensor:
-    r"""One sensor: :math:`e_k = b_k + w_k`, seen `delay` late and held until the next sample.
+    r"""A sensor with the error :math:`e_k = b_k + w_k`, delayed and held until the next sample.
 
-    White noise :math:`w_k \sim N(0, \sigma^2)` is drawn anew at every sample; the bias walks,
-    :math:`b_{k+1} = b_k + N(0, \sigma_b^2 \Delta t)`, from its offset at reset. Random numbers
-    are drawn by physics step, so a reading does not depend on how often one reads.
+    White noise :math:`w_k \sim N(0, \sigma^2)` is drawn for every sample; the bias is a random
+    walk, :math:`b_{k+1} = b_k + N(0, \sigma_b^2 \Delta t)`, from its offset at reset. Random
+    numbers are drawn per physics step, so readings do not depend on how often one reads.
     """
 
     def __init__(self, model: SensorModel) -> None:
@@ -70,25 +70,25 @@ class Sensor:
         """The newest sample that has arrived."""
 
     def reset(self, rng: np.random.Generator, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Forget the past; the robot counts as at rest in this state until the first sample."""
+        """Restart; the present state is the reading until the first sample arrives."""
         self._rng = rng
         self._arriving.clear()
         self._bias = self.model.offset * rng.standard_normal(self.model.offset.size)
         self.sample = self._draw(qpos, qvel)
 
     def hold(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """See a state to which the robot was moved by hand at once; bias and noise go on."""
+        """Sample a state that was set directly, without delay; bias and noise continue."""
         self._arriving.clear()
         self.sample = self._draw(qpos, qvel)
 
     def observe(self, step: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Let physics step `step` pass, at whose end the robot is in (qpos, qvel)."""
+        """Process physics step `step`, at whose end the state is (qpos, qvel)."""
         model = self.model
         if step % model.period == 0:
             if self._walks:
                 walk = model.walk * math.sqrt(model.period * model.time_step)
                 self._bias = self._bias + walk * self._rng.standard_normal(walk.size)
-            # Drawn even if the sample is lost, so that dropouts don't shift the noise.
+            # Drawn even if the sample is lost, so that dropouts do not shift the noise sequence.
             sample = self._draw(qpos, qvel)
             if not model.dropout or self._rng.random() >= model.dropout:
                 self._arriving.append((step + model.delay, sample))
@@ -101,16 +101,16 @@ class Sensor:
 
 
 class Sensors:
-    """All sensors of a robot: what they make of its true state.
+    """All sensors of a robot: measured from true state.
 
-    The measured attitude takes its heading from `slam` and roll and pitch from `imu`, as a robot
-    with both does: a late lidar pose then never tilts the horizon of the balance controller.
+    The measured attitude takes its heading from `slam` and roll and pitch from `imu`, as on a
+    robot with both, so that a delayed lidar pose never tilts the balance controller's horizon.
 
     Args:
-        model: Model with the robot first, on a free base or on none.
+        model: Model with the robot first, with a free base or a fixed one.
         nq: Size of the robot's position.
-        nv: Size of its velocity.
-        noise: How the sensors err.
+        nv: Size of the robot's velocity.
+        noise: Noise of the sensors.
         time_step: Physics step [s].
 
     Raises:
@@ -136,25 +136,25 @@ class Sensors:
         }
 
     def reset(self, seed: np.random.SeedSequence, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Start anew from a robot at rest; each sensor gets its own stream of `seed`."""
+        """Restart from a robot at rest; each sensor gets its own random stream of `seed`."""
         truth = (qpos.copy(), qvel.copy())
         for sensor, child in zip(self._sensors.values(), seed.spawn(4), strict=False):
             sensor.reset(np.random.default_rng(child), *truth)
 
     def hold(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """See a state to which the robot was moved by hand, without delay."""
+        """Sample a state that was set directly, without delay."""
         truth = (qpos.copy(), qvel.copy())
         for sensor in self._sensors.values():
             sensor.hold(*truth)
 
     def observe(self, step: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Let physics step `step` pass, at whose end the robot is in (qpos, qvel)."""
+        """Process physics step `step`, at whose end the state is (qpos, qvel)."""
         truth = (qpos.copy(), qvel.copy())
         for sensor in self._sensors.values():
             sensor.observe(step, *truth)
 
     def read(self, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the sensors say while the robot is in (qpos, qvel), as fresh arrays.
+        """Measured state while the true one is (qpos, qvel), as new arrays.
 
         Returns:
             Measured position and velocity. Shapes (nq,), (nv,).
@@ -170,7 +170,7 @@ class Sensors:
         slam, imu = self._sensors["slam"].sample, self._sensors["imu"].sample
         velocity = self._sensors["velocity"].sample
         heading = quat_yaw(slam.qpos[3:7]) + slam.error[3]
-        # The IMU errs about the body's own X and Y axes; its heading is then taken out.
+        # IMU errors are about the body's X and Y axes; its heading is replaced by that of `slam`.
         tilted = quat_multiply(imu.qpos[3:7], quat_exp(np.array([*imu.error[:2], 0.0])))
         quat = quat_multiply(quat_from_yaw(heading - quat_yaw(tilted)), tilted)
         quat /= np.linalg.norm(quat)
@@ -184,7 +184,7 @@ class Sensors:
 def _make_sensor_models(
     noise: NoiseConfig, joint_scale: np.ndarray, time_step: float
 ) -> dict[str, SensorModel]:
-    """Make the model of every sensor; `joint_scale` (n,) is 1 for a hinge."""
+    """Make the error model of every sensor; `joint_scale` (n,) is 1 for a hinge."""
 
     def make(name: str, white: np.ndarray, walk: np.ndarray, offset: np.ndarray) -> SensorModel:
         rate = noise.get(f"{name}_rate")

@@ -1,4 +1,4 @@
-"""The simulated body: MuJoCo at 200 Hz behind the interface of a plant."""
+"""Simulated plant: MuJoCo, by default at 200 Hz."""
 
 from __future__ import annotations
 
@@ -35,27 +35,27 @@ _DIVERGED = (
 
 
 class Simulation(Plant):
-    """A robot in a scene, simulated.
+    """A simulated robot in a scene.
 
-    The robot is the first in the model: what it publishes (`qpos`, `qvel`) is its own, not that
-    of the scene's objects, which `object_names` and `get_object_pose` give.
+    The robot comes first in the model; the published `qpos` and `qvel` are its own. The scene's
+    objects are accessible by `object_names` and `get_object_pose`.
 
-    `step` lets time pass in whole physics steps, with the targets of the last `apply`. After it
-    the body and site positions in `data` belong to the new position. If the numbers ever run
-    away, the robot freezes in its last sound state and counts as fallen until `reset`.
+    `step` advances by whole physics steps with the targets of the last `apply`. After it, body and
+    site positions in `data` are those of the new `qpos`. If the physics diverges, the robot
+    freezes in its last valid state and counts as fallen until `reset`.
 
     `step`, `measure` and `render` may be called from different threads.
 
     Args:
         morphology: The robot.
-        config: Scene, noise, seed, pictures.
-        kind: Which of its models to simulate; tests use the planning model to compare with it.
-        model: A ready model with the robot first, instead of robot and scene by name.
-        standing: Where `reset` puts the robot, instead of its standing posture. Shape (nq,).
+        config: Scene, noise, seed, images.
+        kind: Model to simulate; tests use the planning model for comparisons.
+        model: A compiled model with the robot first, instead of the robot in the named scene.
+        standing: Configuration after `reset`; by default the standing posture. Shape (nq,).
 
     Raises:
         UnknownName: If there is no such scene.
-        BadValue: If the physics step doesn't divide 20 ms, or a sensor's rate or delay is no
+        BadValue: If the physics step does not divide 20 ms, or a sensor's rate or delay is not a
             whole number of physics steps.
     """
 
@@ -77,7 +77,7 @@ class Simulation(Plant):
         _log_mujoco_warnings()
         self.model = model
         model.opt.timestep = self.config.time_step
-        # MuJoCo would put a diverged model back to its start without a word to the caller.
+        # Autoreset would silently restart a diverged simulation.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.data = mujoco.MjData(model)
         self._base = model.body(morphology.base_body).id
@@ -103,14 +103,14 @@ class Simulation(Plant):
 
             self._viewer = start_viewer(model, self.data, self.config.viewer_port)
 
-    # -- the plant -------------------------------------------------------------------------
+    # -- interface of a plant --------------------------------------------------------------
 
     def reset(self, seed: int | None = None) -> None:
-        """Put the robot at rest in its standing posture and every object where it starts.
+        """Put the robot at rest in its standing posture, and all objects at their start poses.
 
         Args:
-            seed: Seed of the noise; the same seed gives the same run. None takes the next of
-                the configured seed's own sequence, so that episodes of a session differ.
+            seed: Seed of the noise; the same seed gives the same run. None takes the next one of
+                the configured seed's sequence, so that the episodes of a session differ.
         """
         entropy = (self.config.seed, 0, self._num_resets) if seed is None else (seed, 1)
         with self._lock:
@@ -128,7 +128,7 @@ class Simulation(Plant):
             self._sensors.reset(np.random.SeedSequence(entropy), *self._get_true_state())
 
     def measure(self) -> Measurement:
-        """Read the sensors; every array is fresh, and reading changes nothing."""
+        """Read the sensors, without side effects; all arrays are new."""
         with self._lock:
             true_qpos, true_qvel = self._get_true_state()
             qpos, qvel = self._sensors.read(true_qpos, true_qvel)
@@ -145,7 +145,7 @@ class Simulation(Plant):
             )
 
     def apply(self, targets: np.ndarray) -> None:
-        """Set the target of every actuator; the model itself limits control and torque.
+        """Set the target of every actuator; the model limits controls and torques.
 
         Raises:
             BadShape: If there are not `nu` targets.
@@ -157,7 +157,7 @@ class Simulation(Plant):
             self._ramp_to = None
 
     def ramp(self, targets: np.ndarray) -> None:
-        """Go to the targets in a straight line over the physics steps of the next `step`.
+        """Interpolate linearly to the targets over the physics steps of the next `step`.
 
         Raises:
             BadShape: If there are not `nu` targets.
@@ -168,7 +168,7 @@ class Simulation(Plant):
             self._ramp_to = targets
 
     def adapt(self, policy: LowLevelPolicy) -> None:
-        """Give the simulated robot the motors that `policy` was trained with."""
+        """Set the motors to those that `policy` was trained with."""
         with self._lock:
             policy.adapt(self.model)
 
@@ -176,7 +176,7 @@ class Simulation(Plant):
         """Simulate `dt` [s].
 
         Raises:
-            BadValue: If `dt` is not a whole number of physics steps; carries both.
+            BadValue: If `dt` is not a whole number of physics steps; names both.
         """
         num_steps = compute_num_steps(dt, self.config.time_step)
         with self._lock:
@@ -196,7 +196,7 @@ class Simulation(Plant):
                 self._viewer.update(self.data)
 
     def render(self, camera: str) -> np.ndarray:
-        """Picture of `camera`. Shape (height, width, 3), uint8.
+        """Image of `camera`. Shape (height, width, 3), uint8.
 
         Raises:
             UnknownName: Listing the cameras.
@@ -211,21 +211,21 @@ class Simulation(Plant):
             self._viewer = None
         self.cameras.close()
 
-    # -- what only a simulation has --------------------------------------------------------
+    # -- specific to a simulation ----------------------------------------------------------
 
     @property
     def time(self) -> float:
-        """Simulated time since reset, exact: steps times step [s]."""
+        """Simulated time since reset, without accumulated rounding [s]."""
         return self._num_steps * self.config.time_step
 
     @property
     def camera_names(self) -> tuple[str, ...]:
-        """Every camera of the model."""
+        """Names of the model's cameras."""
         return self.cameras.names
 
     @property
     def fallen(self) -> bool:
-        """Whether the robot is down now."""
+        """Whether the robot is fallen now."""
         height, cos_tilt = self.data.xpos[self._base, 2], self.data.xmat[self._base, 8]
         return bool(
             self._diverged
@@ -235,16 +235,16 @@ class Simulation(Plant):
 
     @property
     def has_fallen(self) -> bool:
-        """Whether the robot was down at any time since reset."""
+        """Whether the robot has fallen at any time since reset."""
         return self._has_fallen
 
     @property
     def diverged(self) -> bool:
-        """Whether the physics ran away since reset."""
+        """Whether the physics has diverged since reset."""
         return self._diverged
 
     def set_state(self, qpos: np.ndarray, qvel: np.ndarray | None = None) -> None:
-        """Move the robot by hand; sensors see it at once. Shapes (nq,), (nv,)."""
+        """Set the robot's state; sensors measure it at once. Shapes (nq,), (nv,)."""
         qpos = check_vector("qpos", qpos, self.nq)
         qvel = np.zeros(self.nv) if qvel is None else check_vector("qvel", qvel, self.nv)
         with self._lock:
@@ -258,17 +258,17 @@ class Simulation(Plant):
 
     @property
     def lock(self) -> threading.RLock:
-        """Held while time passes; who reads several things of `data` from a thread holds it."""
+        """Lock of the physics; hold it to read `data` consistently from another thread."""
         return self._lock
 
     def take_touches(self) -> set[tuple[str, str]]:
-        """Every collision since the last call or `reset`, however short, as in `contacts`."""
+        """Return all collisions since the last call or `reset`, as in `Measurement.contacts`."""
         with self._lock:
             touches, self._touches = self._touches, set()
         return touches
 
     def rearrange(self) -> None:
-        """Bring everything up to date after furniture or objects were moved by hand."""
+        """Update derived quantities after furniture or objects were moved directly."""
         with self._lock:
             mujoco.mj_forward(self.model, self.data)
             self._collisions = self._contacts.find_collisions(self.data)
@@ -276,7 +276,7 @@ class Simulation(Plant):
 
     @property
     def object_names(self) -> tuple[str, ...]:
-        """Bodies of the scene that move freely."""
+        """Names of the scene's movable bodies."""
         return self._objects.names
 
     def get_object_pose(self, name: str) -> np.ndarray:
@@ -288,7 +288,7 @@ class Simulation(Plant):
         return self._objects.get_pose(self.data, name)
 
     def set_object_pose(self, name: str, pose: np.ndarray) -> None:
-        """Put an object at rest at `pose`, x y z qw qx qy qz. Shape (7,).
+        """Place an object at rest at `pose`, x y z qw qx qy qz. Shape (7,).
 
         Raises:
             UnknownName: Listing the objects.
@@ -313,13 +313,13 @@ class Simulation(Plant):
         mujoco.mju_mat2Quat(quat, self.data.site_xmat[index])
         return make_pose(self.data.site_xpos[index], quat)
 
-    # -- inside ----------------------------------------------------------------------------
+    # -- internals -------------------------------------------------------------------------
 
     def _get_true_state(self) -> tuple[np.ndarray, np.ndarray]:
         return self.data.qpos[: self.nq], self.data.qvel[: self.nv]
 
     def _step_once(self) -> None:
-        """Let one physics step pass; a diverged robot only ages."""
+        """Advance by one physics step; after divergence only the time advances."""
         data = self.data
         self._num_steps += 1
         if not self._diverged:
@@ -334,12 +334,12 @@ class Simulation(Plant):
             self._sensors.observe(self._num_steps, *self._get_true_state())
 
     def _has_run_away(self) -> bool:
-        """Whether the step met a number that is not finite or beyond 1e10: MuJoCo counts these."""
+        """Whether MuJoCo has warned of a number that is not finite or beyond 1e10."""
         warning = self.data.warning
         return any(warning[kind].number for kind in _DIVERGED)
 
     def _freeze(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Keep the last sound position, at rest, and count the robot as fallen."""
+        """Keep the last valid position, at rest, and count the robot as fallen."""
         fastest = int(np.argmax(np.abs(qvel)))
         joint = self.model.joint(int(self.model.dof_jntid[fastest])).name
         logger.error(
@@ -355,16 +355,17 @@ class Simulation(Plant):
         self._diverged = self._has_fallen = True
 
     def _update_positions(self) -> None:
-        """Bring positions of bodies, sites, cameras and lights up to qpos."""
+        """Update positions of bodies, sites, cameras and lights to `qpos`."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         self._has_fallen |= self.fallen
 
     def _compute_holding_targets(self) -> np.ndarray:
-        r"""Control with which position actuators hold the posture; 0 for all others. Shape (nu,).
+        r"""Controls with which position actuators hold the posture; 0 for others. Shape (nu,).
 
-        A position actuator's force is :math:`k_p (u - q) - k_d \dot q`: gain and bias on q cancel.
+        Position actuators are those with the force :math:`k_p (u - q) - k_d \dot q`: the bias on q
+        is the negative gain.
         """
         model = self.model
         targets = np.zeros(model.nu)
@@ -381,7 +382,7 @@ def _compute_robot_size(model: mujoco.MjModel, robot_bodies: np.ndarray) -> tupl
     """Sizes of the robot's position and velocity.
 
     Raises:
-        BadValue: If the robot's joints are not the first of the model.
+        BadValue: If the robot's joints do not come first in the model.
     """
     joints = np.flatnonzero(np.isin(model.jnt_bodyid, robot_bodies))
     if not np.array_equal(joints, np.arange(joints.size)):
@@ -393,9 +394,10 @@ def _compute_robot_size(model: mujoco.MjModel, robot_bodies: np.ndarray) -> tupl
 
 
 def _log_mujoco_warnings() -> None:
-    """Send MuJoCo's warnings to the log, where it would write a file into the user's folder.
+    """Send MuJoCo's warnings to the log; by default it writes a file to the working directory.
 
-    At debug level: a planner's samples may diverge by design; the plant reports its own fault.
+    At debug level, since a planner's samples may diverge by design; the plant reports its own
+    divergence.
     """
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(lambda text: logger.debug("MuJoCo: %s", text))

@@ -1,4 +1,4 @@
-"""Watching a running simulation: MuJoCo's window, or a browser where there is no display."""
+"""Live view of a simulation: MuJoCo's window, or a browser page without a display."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from xop_lerobot.plant.rendering import has_display
 logger = logging.getLogger(__name__)
 
 UPDATE_PERIOD = 0.05
-"""Wall time between two updates of the picture [s]."""
+"""Wall time between two updates of the view [s]."""
 
 HOST = "127.0.0.1"
-"""The browser view is offered to this machine alone."""
+"""The browser view is only accessible from this machine."""
 
 VISIBLE_GROUPS = 3
-"""Geoms of groups 0 to 2 are shown, as MuJoCo's own viewer does at its start."""
+"""Geoms of groups 0 to 2 are shown, as by default in MuJoCo's own viewer."""
 
 
 class Viewer(ABC):
     """Shows a simulation while it runs. `update` may be called at every step.
 
     Args:
-        clock: Wall clock [s]; tests bring their own.
+        clock: Wall clock [s]; tests pass their own.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -40,10 +40,10 @@ class Viewer(ABC):
         self._next_update = -np.inf
 
     def update(self, data: mujoco.MjData) -> bool:
-        """Show the positions in `data`, unless the last picture is younger than 50 ms.
+        """Show the positions in `data`, unless the last update was less than 50 ms ago.
 
         Returns:
-            Whether the picture was renewed.
+            Whether the view was updated.
         """
         now = self._clock()
         if now < self._next_update:
@@ -62,7 +62,7 @@ class Viewer(ABC):
 
 
 class WindowViewer(Viewer):
-    """MuJoCo's own window. Closing it leaves the simulation running."""
+    """MuJoCo's own window; closing it does not stop the simulation."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         super().__init__()
@@ -80,15 +80,15 @@ class WindowViewer(Viewer):
 
 
 class BrowserViewer(Viewer):
-    """A page on this machine that shows every body of the model.
+    """A local web page that shows all bodies of the model.
 
-    Each body is one node `/bodies/<name>`, made of its visible geoms; an update sends poses of
-    those that moved, and nothing while nobody watches.
+    Each body is one node `/bodies/<name>`, made of its visible geoms; an update sends only the
+    poses of bodies that moved, and nothing without a client.
 
     Args:
         model: Model to show.
-        data: Its first positions.
-        port: Port to offer the page on; the next free one is taken if it is in use.
+        data: Its initial positions.
+        port: Port of the page; the next free one is taken if it is in use.
         clock: Wall clock [s].
     """
 
@@ -113,7 +113,7 @@ class BrowserViewer(Viewer):
         for body, mesh in build_body_meshes(model).items():
             name = model.body(body).name or f"body_{body}"
             self._nodes[body] = scene.add_mesh_trimesh(f"/bodies/{name}", mesh)
-        # Look from front left at the robot's middle, as the scene camera does.
+        # Look at the robot from the front left, like the scene camera.
         self._server.initial_camera.position = (2.2, 1.6, 1.6)
         self._server.initial_camera.look_at = (0.0, 0.0, 0.8)
         self._shown: dict[int, np.ndarray] = {}
@@ -126,7 +126,7 @@ class BrowserViewer(Viewer):
 
     @property
     def body_ids(self) -> tuple[int, ...]:
-        """Bodies that are shown."""
+        """Ids of the bodies that are shown."""
         return tuple(self._nodes)
 
     def get_shown_pose(self, body: int) -> np.ndarray:
@@ -213,17 +213,17 @@ def _build_mesh(  # noqa: PLR0911 one return a shape
 
 
 def start_viewer(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> Viewer:
-    """Open a window on the simulation, or offer a page where there is no display.
+    """Open a window on the simulation, or serve a page if there is no display.
 
     Args:
         model: Model to show.
-        data: Its first positions.
+        data: Its initial positions.
         port: Port of the page on this machine.
     """
     if has_display() and _can_open_window():
         try:
             return WindowViewer(model, data)
-        except Exception as fault:  # a display that does not work is no reason to stop
+        except Exception as fault:  # fall back to the browser if the display does not work
             logger.warning("no window can be opened (%s); showing the browser view", fault)
     viewer = BrowserViewer(model, data, port)
     print(f"The simulation can be watched at {viewer.url}", flush=True)
@@ -231,7 +231,7 @@ def start_viewer(model: mujoco.MjModel, data: mujoco.MjData, port: int) -> Viewe
 
 
 def _can_open_window() -> bool:
-    """Ask the window system itself: MuJoCo ends the process if its window can't be opened."""
+    """Whether GLFW can be initialised: MuJoCo would end the process if its window failed."""
     import glfw  # noqa: PLC0415 loads the window system
 
     with warnings.catch_warnings(record=True) as faults:

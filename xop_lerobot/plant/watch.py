@@ -1,4 +1,4 @@
-"""Notices a robot that moves though it is told to stand, and one whose servos give way."""
+"""Detection of unintended motion: moving while commanded to stand, or servos that give way."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ MOVES = "the robot moves though it is told to stand"
 GIVES_WAY = "the robot's servos give way under the load"
 
 STRAY = 0.08
-"""How far a foot or wheel may stray from where the robot was told to stand [m]."""
+"""Largest displacement of a foot or wheel of a robot that is commanded to stand [m]."""
 STEP = 0.10
-"""How far the feet may move against each other meanwhile [m]."""
+"""Largest displacement of the feet relative to each other [m]."""
 SETTLE_S = 1.0
-"""Time from the command to stand until the robot stands [s]; the last step is still taken."""
+"""Time allowed from the command to stand until the robot stands, for its last step [s]."""
 STRAY_LAG_S = 0.2
-"""Time constant of the filter of places, which are as noisy as the robot's odometry [s]."""
+"""Time constant of the low-pass filter of positions, which have the noise of the odometry [s]."""
 STEP_LAG_S = 0.04
-"""The same of the feet against each other, which the encoders tell more exactly [s]."""
+"""The same for positions relative to each other, which encoders measure more accurately [s]."""
 CREEP = 0.01
-"""Speed at which an estimate of the place may drift without a robot that moves [m/s]."""
+"""Drift of the position estimate that does not count as motion [m/s]."""
 STILL = 0.1
-"""Velocity command under which a robot in mobile mode is told to stand [m/s or rad/s]."""
+"""Velocity command below which a robot in mobile mode is meant to stand [m/s or rad/s]."""
 SPEED = 0.3
-"""Mean speed at which it moves all the same [m/s]. Policies step on the spot and drift a bit."""
+"""Mean speed that counts as motion in mobile mode [m/s]; policies step in place and drift a bit."""
 SPAN_S = 0.5
-"""Time over which that mean is taken [s]."""
+"""Averaging time of that speed [s]."""
 GAP_S = 0.3
-"""Time for which a servo may be behind its target by more than the robot's `Servos.gap` [s]."""
+"""Time for which a tracking error may exceed `Servos.gap` [s]."""
 CALM_S = 1.0
-"""Time without any of this after which the trouble is over [s]."""
+"""Time without an anomaly after which `trouble` is cleared [s]."""
 
 
 class Watch:
-    """Watches one robot, period by period, for what no operator should be surprised by.
+    """Monitors a robot for motion that the operator did not command, once per policy period.
 
-    *It moves though it is told to stand.* In stationary mode a second after the last velocity
-    command its feet, or wheels, are to stay where they are; in mobile mode, where policies step
-    on the spot, its base is not to move at speed while the velocity commands are about zero.
-    The place where it stands follows its estimate slowly, so that one that drifts is no alarm.
+    *It moves while commanded to stand.* In stationary mode, from one second after the last
+    velocity command, feet or wheels must stay in place. In mobile mode, where policies step in
+    place, the base must not move fast while the velocity commands are about zero. The reference
+    position slowly follows the estimate, so that drift of the odometry raises no alarm.
 
-    *Its servos give way.* A joint of the body that is behind its target by more than the robot's
-    `Servos.gap` carries more than its motor can.
+    *Its servos give way.* A body joint whose tracking error exceeds `Servos.gap` carries more than
+    its motor can.
 
     Args:
         morphology: The robot.
@@ -77,9 +77,9 @@ class Watch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all: the robot was put somewhere else."""
+        """Restart the monitor, after the robot was reset."""
         self.trouble = ""
-        """What is wrong, in words; empty while all is well."""
+        """The anomaly as a text; empty for none."""
         self._mode: Mode | None = None
         self._stood = self._gap = self._calm = 0.0
         self._places: np.ndarray | None = None
@@ -87,17 +87,17 @@ class Watch:
         self._track: list[np.ndarray] = []
 
     def update(self, qpos: np.ndarray, action: RobotAction) -> None:
-        """Look at the robot after a period of its policy.
+        """Check the robot after a period of its policy.
 
         Args:
             qpos: Measured position of the robot. Shape (nq,).
-            action: What it executes.
+            action: The executed action.
         """
         found = GIVES_WAY if self._gives_way(qpos, action) else ""
         if self._moves(qpos, action):
             found = found or MOVES
         if found:
-            # A robot that folds also moves, but that is not what is to be done about.
+            # A folding robot also moves; report the cause, not the consequence.
             self.trouble = found if found == GIVES_WAY else self.trouble or found
             self._calm = 0.0
             return
@@ -133,7 +133,7 @@ class Watch:
         self._track.clear()
 
     def _strays(self, qpos: np.ndarray) -> bool:
-        """Whether feet or wheels are not where they were. The first call tells where."""
+        """Whether feet or wheels have moved since the first call after `_forget_place`."""
         places = self._find_places(qpos)
         spread = places - places[0]
         if self._places is None:
@@ -144,20 +144,20 @@ class Watch:
         stray = np.linalg.norm(self._places - self._home, axis=1)
         step = np.linalg.norm(self._spread - self._spread_home, axis=1)
         if stray.max() > STRAY or step.max() > STEP:
-            self._home, self._spread_home = self._places, self._spread
+            self._home, self._spread_home = self._places, self._spread  # detect further motion
             return True
         follow = np.minimum(1.0, CREEP * POLICY_DT / np.maximum(stray, 1e-9))
         self._home = self._home + (self._places - self._home) * follow[:, None]
         return False
 
     def _find_places(self, qpos: np.ndarray) -> np.ndarray:
-        """Where each point on which it stands is, seen from above [m]. Shape (points, 2)."""
+        """Horizontal positions of the contact points [m]. Shape (points, 2)."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         return self._data.site_xpos[self._points, :2].copy()
 
     def _runs(self, qpos: np.ndarray) -> bool:
-        """Whether the base has moved at speed for `SPAN_S`."""
+        """Whether the base has moved faster than `SPEED` on average over `SPAN_S`."""
         self._track.append(np.array([*qpos[:2], quat_yaw(qpos[None, 3:7])[0]]))
         if len(self._track) <= round(SPAN_S / POLICY_DT):
             return False
