@@ -1,1 +1,1 @@
-"""Nouns that every part uses; it imports nothing of the others."""
+"""Types and utilities shared by all packages; it imports none of them."""

@@ -1,4 +1,8 @@
-"""Commands of a low-level policy: named, bounded, with units, and what of them a robot executes."""
+"""Commands of low-level policies: names, units, bounds and rate limits, and robot actions.
+
+`CommandSpace` limits commands, `RobotAction` is what a robot executes, and `ActionLayout` converts
+it from and to LeRobot's flat dictionaries.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 
 
 class Mode(IntEnum):
-    """What the lower body may do; a double pinch toggles it."""
+    """Mode of the lower body: standing in place, or walking and driving."""
 
     STATIONARY = 0
     MOBILE = 1
@@ -30,17 +34,16 @@ class CommandDim:
         low: Lower bound [unit].
         high: Upper bound [unit].
         neutral: Value at which the robot stands at rest [unit].
-        max_rate: Largest change per second that the robot executes [unit/s].
+        max_rate: Rate limit [unit/s].
         mobile_only: Whether the entry is held at `neutral` in stationary mode.
-        sway: How far a `mobile_only` entry may leave `neutral` in stationary mode all the same
-            [unit]. A policy that stands may answer to a small velocity by shifting its weight.
-        sway_rate: Largest change per second of an entry that sways, since haste makes a standing
-            policy step [unit/s].
-        stop_rate: Largest change per second of an entry that is `mobile_only` on its way to neutral
-            once the robot is to stand, since a walk that ends too suddenly throws a robot back
-            [unit/s]; None for `max_rate`.
-        max_accel: Largest change of its rate per second that a teleoperation asks for [unit/s²];
-            None for no limit. `CommandSmoother` keeps it.
+        sway: Largest distance of a `mobile_only` entry from `neutral` in stationary mode [unit]: a
+            standing policy may respond to a small velocity by shifting its weight.
+        sway_rate: Rate limit of such an entry in stationary mode [unit/s]; faster changes make a
+            standing policy step.
+        stop_rate: Rate limit of a `mobile_only` entry when the robot has to stop [unit/s]; stopping
+            a walk too suddenly throws a robot back. None for `max_rate`.
+        max_accel: Acceleration limit in teleoperation, applied by `CommandSmoother` [unit/s²];
+            None for no limit.
 
     Raises:
         BadValue: If the bounds are in the wrong order, `neutral` is not between them, or a limit
@@ -78,8 +81,9 @@ class CommandSpace:
 
     Attributes:
         dims: The entries, in order; their bounds hold in all modes.
-        ranges: Narrower bounds in a mode, by entry: what a low-level policy can do.
-        dead_zones: Size of a velocity under which a low-level policy does nothing, by entry.
+        ranges: Narrower bounds by mode and entry, which a low-level policy can follow.
+        dead_zones: Magnitude of a velocity below which a low-level policy does not react, by
+            entry.
     """
 
     dims: tuple[CommandDim, ...]
@@ -116,7 +120,7 @@ class CommandSpace:
 
     @cached_property
     def _bounds(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """Bounds in each mode. Shapes (k,)."""
+        """Bounds by mode. Shapes (k,)."""
         bounds = []
         for mode in Mode:
             low, high = self.low.copy(), self.high.copy()
@@ -129,7 +133,7 @@ class CommandSpace:
         return tuple(bounds)
 
     def bounds(self, mode: Mode) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest command in `mode`. Shapes (k,)."""
+        """Lower and upper bounds in `mode`. Shapes (k,)."""
         return self._bounds[mode]
 
     def fit(
@@ -138,16 +142,16 @@ class CommandSpace:
         dead_zones: Mapping[str, float],
         stop_rates: Mapping[str, float] | None = None,
     ) -> CommandSpace:
-        """The part of this space that a low-level policy can do.
+        """Return the subset of this space that a low-level policy can follow.
 
         Args:
-            ranges: Bounds in each mode, by entry; entries that are not named keep theirs.
-            dead_zones: Size of a velocity under which nothing happens, by entry.
+            ranges: Bounds by mode and entry; entries that are not named keep theirs.
+            dead_zones: Magnitude of a velocity below which the policy does not react, by entry.
             stop_rates: `CommandDim.stop_rate` of velocities, by entry.
 
         Raises:
-            BadValue: If a range and the robot's bounds have nothing in common, or a stop rate is
-                not positive, or not of a velocity.
+            BadValue: If a range does not overlap with the robot's bounds, or a stop rate is not
+                positive or not of a velocity.
             UnknownName: If there is no such entry.
         """
         for mode, limits in ranges.items():
@@ -174,7 +178,7 @@ class CommandSpace:
         return replace(fitted, dims=bounded)
 
     def extend(self, dims: tuple[CommandDim, ...]) -> CommandSpace:
-        """This space with further entries behind its own."""
+        """Return this space with additional entries at the end."""
         return replace(self, dims=(*self.dims, *dims))
 
     @cached_property
@@ -189,12 +193,12 @@ class CommandSpace:
 
     @cached_property
     def max_rate(self) -> np.ndarray:
-        """Rate limits per second. Shape (k,)."""
+        """Rate limits [unit/s]. Shape (k,)."""
         return self._column("max_rate")
 
     @cached_property
     def max_accel(self) -> np.ndarray:
-        """Largest changes of the rate per second, infinite where there is no limit. (k,)."""
+        """Acceleration limits [unit/s²], infinite for none. Shape (k,)."""
         limits = [np.inf if dim.max_accel is None else dim.max_accel for dim in self.dims]
         column = np.array(limits, dtype=float)
         column.setflags(write=False)
@@ -202,14 +206,14 @@ class CommandSpace:
 
     @cached_property
     def mobile_only(self) -> np.ndarray:
-        """Whether an entry is neutral in stationary mode. Shape (k,), bool."""
+        """Mask of the entries that are neutral in stationary mode. Shape (k,), bool."""
         column = np.array([dim.mobile_only for dim in self.dims], dtype=bool)
         column.setflags(write=False)
         return column
 
     @cached_property
     def sway(self) -> np.ndarray:
-        """How far `mobile_only` entries may leave neutral in stationary mode. Shape (k,)."""
+        """Largest distance of `mobile_only` entries from neutral in stationary mode. (k,)."""
         return self._column("sway")
 
     @cached_property
@@ -222,7 +226,7 @@ class CommandSpace:
 
     @cached_property
     def stop_rate(self) -> np.ndarray:
-        """Rate limits per second of a robot that stops in order to stand. Shape (k,)."""
+        """Rate limits while the robot stops in order to stand [unit/s]. Shape (k,)."""
         rates = [
             dim.stop_rate if dim.mobile_only and dim.stop_rate is not None else dim.max_rate
             for dim in self.dims
@@ -232,27 +236,27 @@ class CommandSpace:
         return column
 
     def compute_max_rate(self, mode: Mode, executed: np.ndarray) -> np.ndarray:
-        """Rate limits per second after `executed`. Shapes (k,) -> (k,)."""
+        """Rate limits after the command `executed` [unit/s]. Shapes (k,) -> (k,)."""
         if mode is Mode.MOBILE:
             return self.max_rate
         if not self._sways.any():
             return self.stop_rate
-        # What is still faster than any sway is being stopped.
+        # A velocity above the sway limit is being stopped, at its stop rate.
         sways = self.mobile_only & (np.abs(executed - self.neutral) <= self.sway + 1e-6)
         return np.where(sways & self._sways, self._sway_rate, self.stop_rate)
 
     def restrict(self, command: np.ndarray, mode: Mode) -> np.ndarray:
-        """What of a command `mode` and the bounds allow. Shapes (..., k)."""
+        """Restrict a command to what `mode` and the bounds allow. Shapes (..., k)."""
         if mode is Mode.STATIONARY:
             still = np.clip(command, self.neutral - self.sway, self.neutral + self.sway)
             command = np.where(self.mobile_only, still, command)
         return np.clip(command, *self.bounds(mode))
 
     def leave_dead_zones(self, command: np.ndarray, mode: Mode) -> np.ndarray:
-        """Move what a policy would not answer to where it does. Shapes (..., k).
+        """Move velocities out of the policy's dead zones in mobile mode. Shapes (..., k).
 
-        In mobile mode a velocity within its dead zone goes to the nearer end: to zero, or to
-        where it acts. For planners: a robot executes what is on the way there too.
+        A velocity within its dead zone is rounded to zero or to the edge of the zone. Only
+        planners need this; a robot executes velocities within the zone, too, while ramping.
         """
         if mode is not Mode.MOBILE or not self.dead_zones:
             return command
@@ -261,12 +265,11 @@ class CommandSpace:
         return np.where(size < self._dead, acts, command)
 
     def compute_rest(self, command: np.ndarray, mode: Mode) -> np.ndarray:
-        """What a robot that executes `command` in `mode` keeps of it to stand still. (k,).
+        """Command to hold in place a robot that executes `command` in `mode`. Shape (k,).
 
-        A standing robot keeps its sway, which holds its weight where it is. A walking one keeps
-        nothing of a velocity, nor does one that is faster than any sway: it is being stopped, and
-        what is left of its velocity on the way down is no sway either. So who stops a robot asks
-        this once, or leaves it mobile until its velocities have stopped.
+        A standing robot keeps its weight shift. In mobile mode, or above the sway limit, velocities
+        go to neutral. While they decrease below the sway limit they must not be taken for a weight
+        shift, so compute this once when stopping, or stay in mobile mode until they are zero.
         """
         stops = self.mobile_only & (np.abs(command - self.neutral) > self.sway + 1e-6)
         if mode is Mode.MOBILE:
@@ -296,7 +299,7 @@ class CommandSpace:
         return np.where(self.mobile_only, step, share * missing)
 
     def index(self, name: str) -> int:
-        """Return the position of `name`.
+        """Return the index of `name`.
 
         Raises:
             UnknownName: Listing the names of this space.
@@ -311,13 +314,13 @@ class CommandSpace:
     ) -> np.ndarray:
         r"""Clip to the bounds and to :math:`|a - a_{prev}| \le \dot a_{max}\,dt`.
 
-        Entries that are `mobile_only` go to neutral, or as near as their `sway`, in stationary
-        mode, also at their rate.
+        In stationary mode `mobile_only` entries go to within their `sway` of neutral, at the rate
+        limits of that mode.
 
         Args:
-            command: Wanted command. Shape (k,).
-            previous: Command executed last, None for no rate limit. Shape (k,).
-            dt: Time since then [s].
+            command: Desired command. Shape (k,).
+            previous: Command executed last; None for no rate limit. Shape (k,).
+            dt: Time since `previous` [s].
             mode: Mode of the robot.
 
         Returns:
@@ -333,7 +336,7 @@ class CommandSpace:
 
 @dataclass(frozen=True)
 class RobotAction:
-    """What one `send_action` asks of a robot.
+    """Action of one `send_action`.
 
     Attributes:
         command: Low-level command. Shape (k,).
@@ -351,11 +354,11 @@ MODE_KEY = "mode.pos"
 
 @dataclass(frozen=True)
 class ActionLayout:
-    """How a `RobotAction` is laid out in LeRobot's flat action dictionary.
+    """Layout of a `RobotAction` in LeRobot's flat action dictionary.
 
     Attributes:
         space: The command space.
-        arm_names: Arm joints, then grippers, as the low-level policy takes them. Shape (m,).
+        arm_names: Arm joints, then grippers, in the order of `RobotAction.arms`. Shape (m,).
     """
 
     space: CommandSpace
@@ -367,12 +370,12 @@ class ActionLayout:
         return (*self.space.keys, MODE_KEY, *(f"{name}.pos" for name in self.arm_names))
 
     def to_dict(self, action: RobotAction) -> dict[str, float]:
-        """Return the flat dictionary of `action`."""
+        """Convert `action` to a flat dictionary."""
         values = (*action.command, float(action.mode), *action.arms)
         return {key: float(value) for key, value in zip(self.keys, values, strict=True)}
 
     def from_dict(self, values: Mapping[str, float], previous: RobotAction) -> RobotAction:
-        """Read a flat, possibly partial dictionary; what is absent stays as in `previous`.
+        """Convert a flat dictionary to an action; absent keys keep their value in `previous`.
 
         Raises:
             UnknownName: If a key is not an action key of this robot.

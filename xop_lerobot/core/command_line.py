@@ -1,8 +1,8 @@
-"""What the commands of this project share: a parser with its errors, readable output, tables.
+"""Shared parts of this project's commands: argument parser, error reports, readable output, tables.
 
-A user's mistake ends LeRobot's commands in one line that names it. LeRobot lets every error end in
-a traceback and wraps those of a device's constructor in its whole configuration, so that what is
-wrong stands at the end of some forty lines. `XOP_TRACEBACK=1` brings the traceback back.
+In LeRobot's commands, an error of this project is reported in one line. LeRobot itself prints a
+traceback for every error and wraps those of a device's constructor in the whole configuration, so
+that the cause is at the end of some forty lines. `XOP_TRACEBACK=1` restores the traceback.
 """
 
 from __future__ import annotations
@@ -26,31 +26,31 @@ _SPELLINGS = {
     "…": "...", "–": "-", "—": "-", "−": "-", "→": "->", "×": "x", "·": ".", "±": "+/-",
     "≤": "<=", "≥": ">=", "°": "deg", "‘": "'", "’": "'", "“": '"', "”": '"', "⚠": "!",
 }  # fmt: skip
-"""What is not just a letter with an accent, or a digit in another place."""
+"""ASCII spellings of characters that Unicode decomposition does not reduce to ASCII."""
 
 
 def make_output_readable() -> None:
-    r"""Let what is printed be read in terminals that cannot show all of it, and never be an error.
+    r"""Make output readable, and never an error, in terminals with a limited encoding.
 
-    Signs are spelt out, letters lose their accents, and anything else becomes its number, as in
-    Python: `1/s²`, `…`, `é` and `手` are `1/s2`, `...`, `e` and `\u624b` in ASCII. Streams that
-    are no terminal, such as pipes, are treated alike; those in UTF-8 stay as they are, but for
-    parts of paths that are no text at all. Each command calls it first.
+    Symbols are spelt out, letters lose their accents, and other characters are escaped as in
+    Python: `1/s²`, `…`, `é` and `手` become `1/s2`, `...`, `e` and `\u624b` in ASCII. This also
+    holds for pipes; UTF-8 streams are unchanged, except for undecodable parts of paths. Every
+    command calls this first.
     """
     codecs.register_error(_SPELL_OUT, _spell_out)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # and nothing that somebody has put in its place
+        if isinstance(stream, io.TextIOWrapper):  # not an object that has replaced it
             stream.reconfigure(errors=_SPELL_OUT)
 
 
 def can_print_anything() -> bool:
-    """Whether standard output can show any text as it is."""
+    """Whether standard output is encoded in UTF-8 or another UTF."""
     encoding = getattr(sys.stdout, "encoding", None) or ""
     return encoding.lower().replace("-", "").startswith("utf")
 
 
 def _spell_out(error: UnicodeError) -> tuple[str, int]:
-    """Replace what an encoding does not have, as an error handler of `codecs` does."""
+    """Error handler for `codecs` that spells out characters which an encoding lacks."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     piece = error.object[error.start : error.end]
@@ -65,11 +65,11 @@ def _spell(character: str) -> str:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser that raises instead of ending the process, and takes no abbreviated flags.
+    """An argument parser that raises instead of exiting, and accepts no abbreviated flags.
 
     Args:
-        prog: Name of the command, as it reads in an error.
-        description: What the command does; kept line by line.
+        prog: Name of the command in messages.
+        description: Description of the command; line breaks are kept.
         options: Any other argument of `argparse.ArgumentParser`.
     """
 
@@ -78,15 +78,15 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(prog=prog, description=description, allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
-        """Raise the error of a malformed command line."""
+        """Raise `BadValue` for a malformed command line."""
         raise BadValue(message)
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
-        """Read the command line.
+        """Parse the command line.
 
         Raises:
-            BadValue: If a flag is absent or malformed.
-            UnknownName: If one is unknown, listing the known ones.
+            BadValue: If a flag is missing or malformed.
+            UnknownName: If a flag is unknown; lists the known ones.
         """
         flags = [flag for action in self._actions for flag in action.option_strings]
         known = [flag for flag in flags if flag.startswith("--")]
@@ -94,7 +94,7 @@ class CommandParser(argparse.ArgumentParser):
         def refuse(word: str) -> NoReturn:
             raise UnknownName(f"flag of {self.prog}", word, known)
 
-        # A misspelt flag is what is wrong, and not that the right one is absent.
+        # Check for unknown flags first: a misspelt flag must not be reported as a missing one.
         for word in arguments:
             if word.startswith("--") and word.partition("=")[0] not in known:
                 refuse(word)
@@ -105,22 +105,22 @@ class CommandParser(argparse.ArgumentParser):
 
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C or SIGTERM, as shells have it."""
+"""Exit code after Ctrl-C or SIGTERM, by the convention of shells (128 + SIGINT)."""
 TRACEBACK_VARIABLE = "XOP_TRACEBACK"
 _COMMANDS = ("lerobot-", "lerobot_")
 
 
 def find_mistake(error: BaseException | None) -> XopError | None:
-    """Return the outermost error of this project among `error` and its explicit causes."""
+    """Return the outermost error of this project in the chain of explicit causes of `error`."""
     while error is not None and not isinstance(error, XopError):
         error = error.__cause__
     return error
 
 
 def report_mistakes() -> None:
-    """Let this project's errors end the process in one line, if one of LeRobot's commands runs.
+    """Report this project's errors in one line if one of LeRobot's commands is running.
 
-    Programs of others keep their tracebacks, and so do all other errors.
+    Other programs, and all other errors, keep their tracebacks.
     """
     program = Path(sys.argv[0]).name if sys.argv else ""
     stock = sys.excepthook
@@ -142,14 +142,14 @@ def report_mistakes() -> None:
 
 
 def split_pair(text: str, form: str) -> tuple[str, str]:
-    """Split `NAME=VALUE`, both without blanks around them.
+    """Split `NAME=VALUE`, stripped of blanks.
 
     Args:
-        text: What was given.
-        form: What must be given, as a message begins: `--part takes NAME=SHARE`.
+        text: The text to split.
+        form: Expected form, with which the message begins: `--part takes NAME=SHARE`.
 
     Raises:
-        BadValue: If either is missing.
+        BadValue: If name or value is missing.
     """
     name, _, value = (part.strip() for part in text.partition("="))
     if not (name and value):
@@ -158,27 +158,27 @@ def split_pair(text: str, form: str) -> tuple[str, str]:
 
 
 def say_count(count: int, noun: str) -> str:
-    """Return a number of things in words: 1 episode, 2 episodes.
+    """Format a count with its noun: 1 episode, 2 episodes.
 
     Args:
-        count: How many.
-        noun: What, in the singular; a regular one.
+        count: The count.
+        noun: A regular noun in the singular.
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 _NUMBER = re.compile(r"[-+]?\.?\d[-+±/.,:%\d\se]*$|-?$")
-"""Numbers in a table, such as 3/20 or 1.5 ± 0.2; a dash or nothing stands for a missing one."""
+"""Numeric cells of a table, such as 3/20 or 1.5 ± 0.2; a dash or an empty cell is a missing one."""
 
 
 def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format a table for a terminal: heads, a rule and a line for each row.
+    """Format a table for a terminal: heads, a rule and one line per row.
 
-    A column whose cells are all numbers is aligned right, any other one left.
+    Columns of numbers are aligned right, others left.
 
     Args:
         heads: Head of each column.
-        rows: Cells of each row, as many as there are heads.
+        rows: Cells of each row, one per head.
     """
     columns = list(zip(heads, *rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
@@ -188,11 +188,11 @@ def format_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def align_cells(cells: Sequence[str], widths: Sequence[int], right: Sequence[bool]) -> str:
-    """Put the cells of a row into columns of given widths, two spaces apart.
+    """Align the cells of a row in columns of given widths, two spaces apart.
 
     Args:
-        cells: Texts; one that is too long is cut off with an ellipsis.
-        widths: Characters of each column.
+        cells: Texts; those that are too long are truncated with an ellipsis.
+        widths: Width of each column [characters].
         right: Whether each column is aligned right.
     """
     parts = []

@@ -1,4 +1,4 @@
-"""Errors of the library: each names the thing, what was expected, what came, and the choices."""
+"""Errors of the library. Messages name the thing, what was expected, what came, and the choices."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Iterable
 
 
 class XopError(Exception):
-    """Root of every error this project raises on purpose."""
+    """Root of all errors that this project raises on purpose."""
 
 
 class UnknownName(XopError, KeyError):
     """A name is not one of the known ones; the message lists them.
 
     Args:
-        kind: What was looked up, for example ``"robot"``.
-        name: The name that was asked for.
-        known: Every name that would have been valid.
+        kind: Kind of the name, for example ``"robot"``.
+        name: The unknown name.
+        known: All valid names.
     """
 
     def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
@@ -34,16 +34,16 @@ class DuplicateName(XopError):
 
 
 class BadShape(XopError, ValueError):
-    """An array does not have the shape that was asked for."""
+    """An array does not have the expected shape."""
 
     def __init__(self, name: str, expected: object, actual: object) -> None:
         super().__init__(f"{name} must have shape {expected}, got {actual}")
 
 
 class BadValue(XopError):
-    """A value is out of its range or of the wrong kind.
+    """A value is out of range or of the wrong type.
 
-    It is no ValueError on purpose: LeRobot's command line parser hides the text of those.
+    Deliberately not a ValueError: LeRobot's command line parser hides the text of those.
     """
 
 
@@ -70,7 +70,7 @@ class NotConnected(XopError):
 
 
 class LinkError(XopError):
-    """Robot and teleoperator of a session did not find each other."""
+    """Robot and teleoperator could not be connected to one session."""
 
 
 class PolicyFileError(XopError):

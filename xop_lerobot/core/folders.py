@@ -1,7 +1,8 @@
-"""Folders and files that a kill cannot leave half written, and the lock of who writes them.
+"""Atomic writes of folders and files, and locks of folders.
 
-A run works in a folder beside the place and renames the finished one into it. Everything is on the
-disk before it is renamed, so a kill or a power cut leaves the old folder or the new one, whole.
+A run works in a temporary folder beside the destination and renames it into place when complete.
+Everything is flushed to disk before, so a kill or power cut leaves either the old or the new
+folder, complete.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ _NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 
 
 class FolderTaken(XopError):
-    """The folder holds something that must not be touched, or another run works on it."""
+    """The folder contains data that must not be overwritten, or another run is using it."""
 
 
 def lock_folder(folder: Path, refusal: str) -> IO[str]:
-    """Lock a work folder, until the file that is returned is closed or the process ends.
+    """Lock a work folder until the returned file is closed or the process ends.
 
     Raises:
-        FolderTaken: With `refusal`, if another run holds the lock.
+        FolderTaken: With the message `refusal`, if another run holds the lock.
     """
     path = folder / "lock"
     lock = path.open("w", encoding="utf-8")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # A run that ends deletes its work folder, and with it a lock that was opened before.
+        # A run that ends deletes its work folder, and with it a lock file that we opened before.
         if path.exists() and path.samefile(f"/dev/fd/{lock.fileno()}"):
             return lock
     except BlockingIOError:
@@ -46,7 +47,7 @@ def lock_folder(folder: Path, refusal: str) -> IO[str]:
 
 
 def check_no_mount(place: Path, remedy: str) -> None:
-    """Raise `FolderTaken`, ending in `remedy`, if no folder can be renamed to `place`."""
+    """Raise `FolderTaken`, with `remedy`, if `place` is a mount point that can't be replaced."""
     if place.is_mount():
         raise FolderTaken(
             f"'{place}' is a mount point, which a dataset can't take the place of. {remedy}"
@@ -54,10 +55,10 @@ def check_no_mount(place: Path, remedy: str) -> None:
 
 
 def swap_in(new: Path, place: Path, spare: Path) -> None:
-    """Put the folder `new` at `place`, which is on the same file system and may hold another.
+    """Move the folder `new` to `place`, on the same file system, replacing any folder there.
 
-    The old folder ends up at `new`: on Linux, two folders exchange their names in one step. Where
-    the file system cannot do that (some network ones), two renames put it to `spare`.
+    On Linux the two folders exchange their names atomically, so the old one ends up at `new`. File
+    systems without that (some network ones) need two renames, and the old one ends up at `spare`.
     """
     sync_tree(new)
     if not place.exists():
@@ -69,7 +70,7 @@ def swap_in(new: Path, place: Path, spare: Path) -> None:
 
 
 def finish_swap(place: Path, spare: Path, new: Path | None = None) -> None:
-    """Mend a `swap_in` that was cut between its two renames, with `new` if given, else `spare`."""
+    """Complete a `swap_in` interrupted between its renames: with `new` if it exists, else undo."""
     if spare.exists() and not place.exists():
         os.rename(new if new is not None and new.exists() else spare, place)
 
@@ -88,14 +89,14 @@ def _exchange_at_once(first: Path, second: Path) -> bool:
 
 
 def write_whole(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file that is there as a whole or not at all."""
+    """Write a JSON file atomically."""
     draft = path.with_name(f"{path.name}.tmp")
     draft.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     os.replace(draft, path)
 
 
 def append_line(path: Path, line: str) -> None:
-    """Append a JSON line and see it on the disk; what a kill has left of one before it goes."""
+    """Append a JSON line and flush it to disk; an incomplete last line is removed first."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+b") as file:
         file.seek(0)
@@ -109,7 +110,7 @@ def append_line(path: Path, line: str) -> None:
 
 
 def read_lines(path: Path) -> list[dict[str, Any] | None]:
-    """Read a file of JSON lines, None for a line that is no object; one cut off at the end goes."""
+    """Read JSON lines; None for a line that is not an object. A broken last line is dropped."""
     lines = path.read_bytes().split(b"\n") if path.exists() else [b""]
     rows = [_read_line(line) for line in lines]
     return rows if rows[-1] is not None else rows[:-1]
@@ -124,13 +125,13 @@ def _read_line(line: bytes) -> dict[str, Any] | None:
 
 
 def sync_tree(folder: Path) -> None:
-    """See everything under `folder` on the disk."""
+    """Flush everything under `folder` to disk."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
 
 
 def sync(path: Path) -> None:
-    """See a file, or the names in a folder, on the disk."""
+    """Flush a file, or the entries of a folder, to disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""A log that others cannot fill: so many lines in a second, and then how many were left out."""
+"""Rate-limited logging, for events that a remote peer can cause at will."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from collections import deque
 from collections.abc import Callable
 
 MAX_LINES = 10
-"""Lines that pass in a second."""
+"""Largest number of lines per period."""
 PERIOD_S = 1.0
+"""Period [s]."""
 
 
 class PacedLog:
-    """Passes on at most `MAX_LINES` lines in any second, for what somebody else can cause at will.
+    """Passes on at most `MAX_LINES` lines in any second; thread-safe.
 
-    What is too much is counted, and the next line that passes says how many there were. May be
-    called from any thread.
+    Further lines are counted, and their number is logged before the next line that passes.
 
     Args:
-        logger: Where the lines go.
-        clock: Time [s]; tests bring their own.
+        logger: Destination of the lines.
+        clock: Time [s]; tests pass their own.
     """
 
     def __init__(self, logger: logging.Logger, clock: Callable[[], float] = time.monotonic) -> None:
@@ -31,11 +31,11 @@ class PacedLog:
         self._lock = threading.Lock()
 
     def info(self, message: str, *args: object) -> None:
-        """Log a line that tells."""
+        """Log at level INFO."""
         self._log(logging.INFO, message, args)
 
     def warning(self, message: str, *args: object) -> None:
-        """Log a line that warns."""
+        """Log at level WARNING."""
         self._log(logging.WARNING, message, args)
 
     def exception(self, message: str, *args: object) -> None:

@@ -1,4 +1,4 @@
-"""Pages that need no other file: their frame, their common looks, and what is put into them."""
+"""Self-contained HTML pages: frame, common style, and embedding of files and data."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe
 
 
 def make_head(title: str, style: str = "") -> str:
-    """Begin a page, up to and with `<body>`; browsers are told to fetch nothing from elsewhere."""
+    """Begin a page, up to `<body>`; its content security policy forbids external requests."""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
@@ -38,17 +38,17 @@ FOOT = "\n</body></html>\n"
 
 
 def escape(text: object) -> str:
-    """Write any text so that a page shows it as it is."""
+    """Escape a text for HTML."""
     return html.escape(str(text))
 
 
 def embed(content: bytes, kind: str) -> str:
-    """Return the address of a file that is in the page itself; `kind` is such as `image/png`."""
+    """Return a data URL of a file; `kind` is its media type, such as `image/png`."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def dump_script(value: Any) -> str:
-    """Write plain values as JSON that may stand in a `<script>`."""
+    """Write plain values as JSON that is safe in a `<script>`."""
     text = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-    # Nothing in it may end the script; in JSON `<` stands in texts alone.
+    # Nothing in it may end the script; in JSON, `<` occurs only in strings, where it is escaped.
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

@@ -1,10 +1,10 @@
-"""Jobs in parallel workers, of which each may die without taking others along.
+"""Parallel jobs in a fault-tolerant pool of workers.
 
-A worker is started once and does one job after another, so that imports are paid once. The
-standard library's `ProcessPoolExecutor` loses all jobs that are under way when one process dies,
-and does not say which one it was; here a new worker takes the dead one's place, and its job is done
-again, or comes back with an error. Workers are processes of this machine (`run_jobs`), or of many
-(`xop_lerobot.core.pool_ray`); what is common to both is `drive`.
+A worker runs one job after another, so imports are paid once. If a process dies, the standard
+library's `ProcessPoolExecutor` loses all running jobs and does not say which one was at fault. Here
+a new worker replaces the dead one, and its job is retried or returned with an error. Workers are
+processes of this machine (`run_jobs`) or of a cluster (`xop_lerobot.core.pool_ray`); `drive` is
+common to both.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ THREAD_VARIABLES = (
     "NUMEXPR_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
-"""What tells libraries how many threads to start; read when they are loaded."""
+"""Variables for the number of threads of numerical libraries, which read them on import."""
 ENVIRONMENT: Mapping[str, str] = {
-    # Each worker has one core: more threads would only wait for each other.
+    # Each worker has one core; more threads would only compete for it.
     **dict.fromkeys(THREAD_VARIABLES, "1"),
     "LP_NUM_THREADS": "0",
     "TQDM_DISABLE": "1",
 }
-"""What the workers' libraries read when they are loaded."""
+"""Environment of the workers, which their libraries read on import."""
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """What became of one job.
+    """Result of one job.
 
     Attributes:
         job: The job.
-        value: What the function returned, None after an error.
-        error: What went wrong: the text of an error that the project raises on purpose; of
-            others one line and then the traceback; empty where all went well.
-        again: Whether the job is being done once more, so that another result will follow.
+        value: Return value of the function; None after an error.
+        error: Error text: the message of an error of this project, otherwise one line and the
+            traceback; empty on success.
+        again: Whether the job is retried, so that another result will follow.
     """
 
     job: Any
@@ -68,22 +68,22 @@ class JobResult:
 
 
 class WorkerDied(Exception):
-    """A worker ended before its job did; the message says how."""
+    """A worker died during a job; the message says how."""
 
 
 class Worker(Protocol):
-    """Does one job at a time."""
+    """Runs one job at a time."""
 
     def do(self, job: Any) -> tuple[Any, str]:
-        """Do a job; return its value and its error, as in `JobResult`.
+        """Run a job; return its value and its error, as in `JobResult`.
 
         Raises:
-            WorkerDied: If the worker ends before the job does.
+            WorkerDied: If the worker dies during the job.
         """
         ...
 
     def stop(self) -> None:
-        """End it at once, whatever it is at; `do` raises in its thread."""
+        """Kill the worker; a running `do` raises in its thread."""
 
 
 def run_jobs(
@@ -94,20 +94,19 @@ def run_jobs(
     tries: int = 1,
     preload: Sequence[str] = (),
 ) -> Generator[JobResult]:
-    """Do `function(job)` for every job in parallel processes, and yield results as they come.
+    """Run `function(job)` for every job in parallel processes, and yield results as they come.
 
     Args:
-        function: What can be pickled: a function of a module, or an object to be called, which
-            each worker gets once and may keep things in from job to job.
-        jobs: Arguments, which can be pickled; started in this order, and taken from here when a
-            worker is free and not before.
+        function: A picklable function, or a callable object, which each worker receives once and
+            which may keep state between jobs.
+        jobs: Picklable arguments; started in this order, and consumed only when a worker is free.
         workers: Number of processes.
-        tries: How often a job is begun before its workers' deaths are an error.
-        preload: Modules that are imported once for all workers, where processes can be forked.
+        tries: Number of attempts after which the death of a worker is an error.
+        preload: Modules that are imported once for all workers, if processes can be forked.
 
     Yields:
-        One result for each job, and one more for each time that it is begun again. Whatever ends
-        the iteration ends the workers too.
+        One result per job, and one more per retry. The workers end with the iteration, however it
+        ends.
     """
     return drive(partial(_Process, function, _make_context(preload)), jobs, workers, tries)
 
@@ -115,17 +114,17 @@ def run_jobs(
 def drive(
     start: Callable[[], Worker], jobs: Iterable[Any], workers: int, tries: int
 ) -> Generator[JobResult]:
-    """Do all jobs with at most so many workers, of which `start` makes each; see `run_jobs`."""
+    """Run all jobs with at most `workers` workers, made by `start`; see `run_jobs`."""
     fresh, again = iter(jobs), deque[tuple[Any, int]]()
     idle: list[Worker] = []
     busy: dict[Future[tuple[Any, str]], tuple[Worker, Any, int]] = {}
-    with ThreadPoolExecutor(workers) as threads:  # each waits for a worker
+    with ThreadPoolExecutor(workers) as threads:  # one thread waits for each worker
         try:
             while True:
                 while len(busy) < workers and (order := _pick(fresh, again)):
                     worker = idle.pop() if idle else start()
                     busy[threads.submit(worker.do, order[0])] = (worker, *order)
-                while idle:  # there is nothing left for them, and others may wait for their cores
+                while idle:  # no jobs are left: release their cores
                     idle.pop().stop()
                 if not busy:
                     return
@@ -148,7 +147,7 @@ def drive(
 
 
 def _pick(fresh: Iterable[Any], again: deque[tuple[Any, int]]) -> tuple[Any, int] | None:
-    """The next job, and how often it will have been begun; None if there is none."""
+    """The next job and the number of its attempt; None if there is none."""
     if again:
         return again.popleft()
     for job in fresh:
@@ -157,17 +156,17 @@ def _pick(fresh: Iterable[Any], again: deque[tuple[Any, int]]) -> tuple[Any, int
 
 
 def do_job(function: Function, job: Any) -> tuple[Any, str]:
-    """Do one job; return its value and its error, as in `JobResult`."""
+    """Run one job; return its value and its error, as in `JobResult`."""
     try:
         return function(job), ""
     except XopError as error:
         return None, str(error)
-    except Exception as error:  # whatever it is, the other jobs go on
+    except Exception as error:  # a failing job must not end the others
         return None, f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
 
 
 def _make_context(preload: Sequence[str]) -> Context:
-    """Processes that share nothing with this one: a fork would share OpenGL and threads."""
+    """Start method without a fork of this process, which would share OpenGL and threads."""
     if not preload or "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
@@ -179,8 +178,8 @@ class _Process:
     """A worker that is a process of this machine.
 
     Args:
-        function: What does a job.
-        context: How processes are started.
+        function: The function that runs a job.
+        context: Start method of processes.
     """
 
     def __init__(self, function: Function, context: Context) -> None:
@@ -208,11 +207,11 @@ class _Process:
 
 
 def _work(function: Function, pipe: Connection) -> None:
-    """Do jobs until the other end of the pipe is closed, or the parent has ended."""
-    # Ctrl-C reaches the whole process group; the parent alone answers it.
+    """Run jobs until the other end of the pipe is closed, or the parent has ended."""
+    # Ctrl-C reaches the whole process group; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow_parent, daemon=True).start()
-    # What a command prints on standard output is for other programs, and encoders talk.
+    # Standard output of a command is for other programs; video encoders would print to it.
     os.dup2(2, 1)
     with suppress(EOFError, BrokenPipeError):
         while True:
@@ -220,7 +219,7 @@ def _work(function: Function, pipe: Connection) -> None:
 
 
 def _follow_parent() -> None:
-    """End with the parent, however it ends, so that no two runs work on the same files."""
+    """Exit with the parent, however it ends, so that no two runs work on the same files."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -229,7 +228,7 @@ def _follow_parent() -> None:
 
 @contextmanager
 def set_environment(variables: Mapping[str, str]) -> Generator[None]:
-    """Set environment variables for a while."""
+    """Set environment variables within a block."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:

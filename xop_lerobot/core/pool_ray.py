@@ -1,8 +1,7 @@
-"""Jobs in workers all over a Ray cluster; Ray is an optional extra, `pip install …[ray]`.
+"""Jobs in workers of a Ray cluster; Ray is an optional extra, `pip install …[ray]`.
 
-Nothing but the jobs and their results goes from machine to machine, so they need no common disk.
-What they do need is this project in the same versions, which is checked: the same seeds shall
-give the same episodes.
+Only jobs and their results are sent between machines, so no shared disk is needed. All machines
+need the same versions of this project, so that equal seeds give equal episodes; this is checked.
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ from xop_lerobot.core.pool import ENVIRONMENT, Function, JobResult, WorkerDied, 
 from xop_lerobot.core.versions import read_versions
 
 LOCAL = "local"
-"""Address that starts a cluster of this machine alone, for as long as the jobs take."""
+"""Address that starts a temporary cluster on this machine."""
 
 _LONGEST = 250
-"""Letters of what Ray says of a death that are told."""
+"""Largest number of characters of Ray's message on a dead worker."""
 
 
 class RayUnavailable(XopError):
-    """Ray is not installed, or there is no cluster at the address."""
+    """Ray is not installed, or no cluster answers at the address."""
 
 
 class OtherVersions(XopError):
-    """A machine of the cluster has other versions than this one."""
+    """A machine of the cluster has different versions from this one."""
 
 
 def run_jobs_on_ray(
@@ -43,20 +42,19 @@ def run_jobs_on_ray(
     address: str,
     tries: int = 1,
 ) -> Generator[JobResult]:
-    """Do `function(job)` for every job on a Ray cluster; see `xop_lerobot.core.pool.run_jobs`.
+    """Run `function(job)` for every job on a Ray cluster; see `xop_lerobot.core.pool.run_jobs`.
 
     Args:
-        function: As there; its module can be imported on all machines.
-        jobs: As there.
-        workers: Number of workers, each on a core of its own; 0 for one for each of the
-            cluster's cores.
+        function: As in `run_jobs`; its module must be importable on all machines.
+        jobs: As in `run_jobs`.
+        workers: Number of workers, one core each; 0 for one per core of the cluster.
         address: `local`, `auto` for the cluster that this machine is part of, `HOST:PORT`, or
             `ray://HOST:PORT`.
         tries: As in `run_jobs`.
 
     Raises:
-        RayUnavailable: If Ray is not installed, or does not answer there.
-        OtherVersions: If a machine of it has other versions than this one.
+        RayUnavailable: If Ray is not installed, or no cluster answers at the address.
+        OtherVersions: If a machine of the cluster has different versions from this one.
     """
     ray = _import_ray()
     mine = not ray.is_initialized()
@@ -71,7 +69,7 @@ def run_jobs_on_ray(
 
 
 def _import_ray() -> Any:
-    # It asks at its first start whether it may tell of its use; nobody is there to answer.
+    # At its first start Ray would ask about usage statistics; there is nobody to answer.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray  # noqa: PLC0415 optional
@@ -86,7 +84,7 @@ def _import_ray() -> Any:
 def _connect(ray: Any, address: str, workers: int) -> None:
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
     if address == LOCAL:
-        # A machine counts as many cores as this process may use, and not as it has.
+        # The cores that this process may use, which can be fewer than the machine has.
         cores = workers or len(os.sched_getaffinity(0))
         options |= {"address": LOCAL, "num_cpus": cores, "include_dashboard": False}
     else:
@@ -102,10 +100,10 @@ def _connect(ray: Any, address: str, workers: int) -> None:
 
 
 class _Hand:
-    """What runs in a worker's process.
+    """The part of a worker that runs in the actor's process.
 
     Args:
-        function: What does a job.
+        function: The function that runs a job.
     """
 
     def __init__(self, function: Function) -> None:
@@ -116,7 +114,7 @@ class _Hand:
         return platform.node(), read_versions()
 
     def do(self, job: Any) -> tuple[Any, str]:
-        """Do a job; return its value and its error."""
+        """Run a job; return its value and its error."""
         return do_job(self._function, job)
 
 
@@ -125,11 +123,11 @@ class _Actor:
 
     Args:
         ray: The module.
-        function: What does a job.
+        function: The function that runs a job.
     """
 
     def __init__(self, ray: Any, function: Function) -> None:
-        # Paths of the main process are not the machines'; what is set here holds for the libraries.
+        # Only these variables: other variables of the main process may hold local paths.
         environment = {"env_vars": dict(ENVIRONMENT)}
         make = ray.remote(num_cpus=1, max_restarts=0, runtime_env=environment)(_Hand)
         self._ray, self._hand = ray, make.remote(function)
@@ -142,7 +140,7 @@ class _Actor:
                 self._is_checked = True
             return self._ray.get(self._hand.do.remote(job))
         except self._ray.exceptions.RayError as error:
-            # The first line says what became of it, and the last why, if anybody knows.
+            # The first line says what happened; the last one says why, if known.
             text = re.sub(r"\x1b\[[\d;]*m", "", str(error))  # without colours
             lines = [line.strip() for line in text.splitlines() if line.strip()]
             why = " ".join(dict.fromkeys(lines[:1] + lines[-1:])) or repr(error)
@@ -153,10 +151,10 @@ class _Actor:
 
 
 def _check_versions(machine: str, versions: str) -> None:
-    """Check that a machine has the versions that this one has.
+    """Check that a machine has the same versions as this one.
 
     Raises:
-        OtherVersions: If it has not.
+        OtherVersions: If it does not; lists the differences.
     """
     theirs, ours = json.loads(versions), json.loads(read_versions())
     wrong = [name for name in ours if theirs.get(name) != ours[name]]

@@ -1,4 +1,4 @@
-"""A name-to-thing table that refuses duplicates and lists the choices when a name is unknown."""
+"""Registry of objects by name, which rejects duplicates and lists the choices for unknown names."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from xop_lerobot.core.errors import DuplicateName, UnknownName
 
 
 class Registry[T]:
-    """Things of one kind by name.
+    """Objects of one kind by name.
 
     Args:
-        kind: What is registered, as it reads in an error (``"robot"``).
-        places: Where the things of this project are, as ``"module:attribute"`` by name. A module
-            is imported when its thing is first asked for, so a table costs nothing, and a thing
-            can import what has the table.
+        kind: Kind of the objects in messages (``"robot"``).
+        places: Locations of the built-in objects, ``"module:attribute"`` by name. A module is
+            imported at the first access to its object, which keeps imports fast and avoids import
+            cycles.
     """
 
     def __init__(self, kind: str, places: Mapping[str, str] | None = None) -> None:
@@ -26,7 +26,7 @@ class Registry[T]:
 
     @property
     def built_in(self) -> tuple[str, ...]:
-        """Names of the things of this project, without those that were added."""
+        """Names of the built-in objects, without those that were added."""
         return tuple(sorted(self._places))
 
     def add(self, name: str, thing: T) -> T:
@@ -41,23 +41,23 @@ class Registry[T]:
         return thing
 
     def register[Thing](self, name: str) -> Callable[[Thing], Thing]:
-        """Return a decorator that registers what it decorates under `name`."""
+        """Return a decorator that registers the decorated object under `name`."""
 
         def decorate(thing: Thing) -> Thing:
-            self.add(name, cast(T, thing))  # that Thing is a T can't be said of a type variable
+            self.add(name, cast(T, thing))  # a type variable can't be bounded by T
             return thing
 
         return decorate
 
     def remove(self, name: str) -> None:
-        """Forget what was added under `name` (tests add toys and take them away again)."""
+        """Remove the object added under `name`, if any; tests remove their toys."""
         self._things.pop(name, None)
 
     def __getitem__(self, name: str) -> T:
-        """Look `name` up.
+        """Look up `name`.
 
         Raises:
-            UnknownName: Carrying every known name.
+            UnknownName: If it is not registered; lists all names.
         """
         if name not in self:
             raise UnknownName(self.kind, name, self)

@@ -1,4 +1,4 @@
-"""Signals: SIGTERM is a clean stop like Ctrl-C, and neither cuts an episode's save in two."""
+"""Signal handling: SIGTERM stops cleanly like Ctrl-C, and neither interrupts saving an episode."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ logger = logging.getLogger(__name__)
 class TermAsInterrupt:
     """While installed, the first SIGTERM raises KeyboardInterrupt and later ones are ignored.
 
-    LeRobot closes its files on KeyboardInterrupt, but dies of SIGTERM, which is what a
-    container, a service manager or a time-out sends.
+    LeRobot closes its files on KeyboardInterrupt, but is killed by SIGTERM, which containers,
+    service managers and time-outs send.
     """
 
     def __init__(self) -> None:
         self._installed = False
 
     def install(self) -> None:
-        """Take SIGTERM over, unless the program handles it already. Main thread only."""
+        """Handle SIGTERM, unless the program does already. Main thread only."""
         if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
             signal.signal(signal.SIGTERM, self._interrupt)
             self._installed = True
 
     def remove(self) -> None:
-        """Give SIGTERM back; may be called twice, and from any thread."""
+        """Restore the default of SIGTERM; may be called twice, and from any thread."""
         in_main = threading.current_thread() is threading.main_thread()
         if self._installed and in_main:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -61,7 +61,7 @@ def stop_on_sigterm() -> Iterator[None]:
 
 @contextmanager
 def hold_signals() -> Iterator[None]:
-    """Keep SIGINT and SIGTERM back until the block is done, then let them act."""
+    """Defer SIGINT and SIGTERM until the end of the block."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

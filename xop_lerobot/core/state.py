@@ -1,4 +1,4 @@
-"""What a robot publishes each tick, and what the operator wants of it."""
+"""State of a robot and goal of the operator, as exchanged once per control tick."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from xop_lerobot.core.command import Mode
 
 FRAMES = ("head", "left_wrist", "right_wrist")
-"""Names of the frames an operator drives, in the order of every `tracked` flag."""
+"""Names of the operator's tracked frames, in the order of all `tracked` flags."""
 
 
 def freeze(array: np.ndarray) -> np.ndarray:
-    """Return a read-only copy, so that a published value can never change under a reader."""
+    """Return a read-only float copy, so that a published value never changes."""
     copy = np.array(array, dtype=float)
     copy.setflags(write=False)
     return copy
@@ -22,11 +22,11 @@ def freeze(array: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RobotState:
-    """A robot at one instant; every array is a read-only copy.
+    """State of a robot at one instant; all arrays are read-only copies.
 
     Generalised position and velocity are in MuJoCo's order and conventions (base quaternion
-    wxyz, base linear velocity in the world, base angular velocity in the body) and cover the
-    robot alone, not the objects of a scene.
+    wxyz, base linear velocity in the world, base angular velocity in the body), for the robot only,
+    without the objects of a scene.
 
     Attributes:
         time: Clock of the robot [s]; simulated time in simulation.
@@ -39,12 +39,11 @@ class RobotState:
         effort: Actuator forces [N m or N]. Shape (nu,).
         true_qpos: The simulator's own position; equals `qpos` on hardware. Shape (nq,).
         true_qvel: The simulator's own velocity; equals `qvel` on hardware. Shape (nv,).
-        wall_time: Host clock when it was taken [s since the epoch].
+        wall_time: Host clock at the measurement [s since the epoch].
         fallen: Whether the robot has fallen.
         collision: Whether the robot touches anything but the ground under its feet or wheels.
-        settled: Whether the robot stands still enough to engage.
-        trouble: What the robot does that it was not told to (`plant.watch`), in words; empty
-            while it does what it is told.
+        settled: Whether the robot is stationary enough to engage.
+        trouble: Unintended motion as detected by `plant.watch`, as a text; empty for none.
     """
 
     time: float
@@ -66,13 +65,13 @@ class RobotState:
 
 @dataclass(frozen=True)
 class Goal:
-    """G(t): where the operator wants the tracked frames, in the robot's world.
+    """Goal G(t): desired poses of the tracked frames in the robot's world frame.
 
     Attributes:
-        poses: Desired pose of each bound frame, x y z qw qx qy qz. Shapes (7,).
+        poses: Desired pose of each tracked frame, x y z qw qx qy qz. Shapes (7,).
         velocities: Velocity of each goal, linear [m/s] then angular [rad/s], world axes, for
-            the preview over the horizon; zero where it is not known. Shapes (6,).
-        mode: The mode the operator is in.
+            the preview over the horizon; zero if unknown. Shapes (6,).
+        mode: Requested mode.
         grips: Closing of the left and right hand, 0 open to 1 closed. Shape (2,).
     """
 

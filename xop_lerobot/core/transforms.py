@@ -38,7 +38,7 @@ def quat_rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product over the last axis; np.cross spends four times as long on small arrays."""
+    """Cross product over the last axis; np.cross takes four times as long for small arrays."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
     return _join(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
@@ -51,7 +51,7 @@ def _split(q: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _join(*components: np.ndarray) -> np.ndarray:
-    """Components as the last axis; np.stack spends three times as long on small arrays."""
+    """Stack components along the last axis; np.stack takes three times as long for small arrays."""
     joined = np.empty((*np.shape(components[0]), len(components)))
     for i, component in enumerate(components):
         joined[..., i] = component
@@ -59,7 +59,7 @@ def _join(*components: np.ndarray) -> np.ndarray:
 
 
 def sum_squares(vectors: np.ndarray) -> np.ndarray:
-    """Squared length of vectors; a quarter of the time of a sum over so short an axis.
+    """Squared length of vectors, four times as fast as a sum over a short axis.
 
     Shape (..., n) -> (...).
     """
@@ -98,23 +98,22 @@ def quat_yaw(q: np.ndarray) -> np.ndarray:
 
 
 def compute_heading(q: np.ndarray) -> np.ndarray:
-    r"""Heading of a head about world Z, defined and smooth wherever a person can look [rad].
+    r"""Heading of a head about world Z, smooth over the whole range of human head motion [rad].
 
-    No one axis of a head tells it: the forward axis stands on end in a look straight down and
-    points backwards past it, the left axis stands on end in a head laid on its side. Seen from
-    above, this is the direction of their sum :math:`f + 2\,R_z(-90°)\,l`, which is
+    No single axis of a head defines it: the forward axis is vertical when looking straight down
+    and points backwards beyond, and the left axis is vertical with the head tilted sideways. This
+    heading is the horizontal direction of the sum :math:`f + 2\,R_z(-90°)\,l` of both, which is
 
     .. math:: \arg\left(3\,(w + iz)^2 + (y - ix)^2\right)
 
-    A nod of any size leaves it alone, and so does a tilt to the side of a head that looks ahead;
-    in a look straight down it is where the crown points. A turn about the vertical adds to it.
+    It is invariant to pitch, and to roll of a head that looks ahead; for a head that looks
+    straight down it is the direction of the crown. A rotation about the vertical adds to it.
 
-    Some orientation has to be without a heading, whatever the formula; here it is a head that
-    looks ahead and lies tilted by 120°, to the left or to the right. From straight up to 150°
-    down and with a tilt of up to 45°, no turn changes the heading by more than 1.8 times its
-    angle.
+    Any such function has a singularity; here it is a head that looks ahead, rolled by 120° to
+    either side. From straight up to 150° down, with a roll of up to 45°, a rotation changes the
+    heading by at most 1.8 times its angle.
 
-    For a body that stands upright, and for Tait-Bryan angles, see `quat_yaw`.
+    For an upright body, and for Tait-Bryan angles, see `quat_yaw`.
 
     Args:
         q: Orientation with X forward, Y left, Z up, wxyz. Shape (..., 4).
@@ -143,8 +142,8 @@ def quat_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
 def quat_from_matrix(matrix: np.ndarray) -> np.ndarray:
     """Unit quaternion of rotation matrices. Shape (..., 3, 3) -> (..., 4), wxyz, w >= 0.
 
-    The largest of the four squared components is computed from the diagonal and the others
-    from it, which is well conditioned everywhere (Shepperd's method).
+    The largest of the four squared components is computed from the diagonal, and the others from
+    it, which is well conditioned everywhere (Shepperd's method).
     """
     m = np.asarray(matrix, float)
     trace = np.trace(m, axis1=-2, axis2=-1)
@@ -187,7 +186,7 @@ def pose_inverse(pose: np.ndarray) -> np.ndarray:
 
 
 def level_pose(pose: np.ndarray) -> np.ndarray:
-    """Place and heading of a pose, without its tilt. Shape (..., 7)."""
+    """Position and heading of a pose, without its tilt. Shape (..., 7)."""
     return make_pose(pose[..., :3], quat_from_yaw(compute_heading(pose[..., 3:])))
 
 
@@ -197,15 +196,15 @@ def rotation_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def heading_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    r"""Error of the tilt, and of the heading [rad].
+    r"""Tilt and heading components of an orientation error [rad].
 
-    What turns `quat` into `goal` is a tilt s about a horizontal axis, then a turn ψ about the
+    The rotation from `quat` to `goal` is a tilt s about a horizontal axis, then a turn ψ about the
     vertical: :math:`q_{goal} q^{-1} = R_z(\psi)\,s`. The error is :math:`(\log(s)_{x,y},\ \psi)` in
-    the world's axes. For small errors it is `rotation_error`; but a robot that faces away from
-    its goal is not asked to lean sideways because the operator leans forward: who leans the same
-    way in another heading has no error of the tilt. It needs no heading of either, so that a head
-    that looks straight down, or a hand that points there, has an error like any other. Where the
-    tilt is half a turn there is no ψ.
+    world axes. For small errors it equals `rotation_error`. For large ones, the same lean in
+    another heading has no tilt error, so a robot that faces away from its goal is not made to lean
+    sideways because the operator leans forward. No heading of either orientation is needed, so a
+    head or hand that points straight down is no special case. ψ is undefined for a tilt of half a
+    turn.
 
     Shapes (..., 4) and (..., 4) -> (..., 3).
     """
@@ -218,9 +217,9 @@ def heading_error(goal: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def compute_heading_squares(goal: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    r"""Squares of `heading_error`: of the heading's, and of the tilt's [rad²].
+    r"""Squared heading error and squared tilt error of `heading_error` [rad²].
 
-    Without the vector itself, in a fraction of its time.
+    Much faster than `heading_error`, since the vector itself is not computed.
 
     Shapes (..., 4) and (..., 4) -> (...), (...).
     """
@@ -236,12 +235,12 @@ def compute_heading_squares(goal: np.ndarray, quat: np.ndarray) -> tuple[np.ndar
 
 
 def _double_angle(sine: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """Twice the angle of a quaternion's two entries, its sign left aside, in [-pi, pi]."""
+    """Rotation angle of a quaternion with these entries, of either sign, in [-pi, pi]."""
     return 2 * np.arctan2(np.where(cosine < 0, -sine, sine), np.abs(cosine))
 
 
 def skew(v: np.ndarray) -> np.ndarray:
-    """Matrix of the cross product with `v`. Shape (3,) -> (3, 3)."""
+    """Skew-symmetric matrix of the cross product with `v`. Shape (3,) -> (3, 3)."""
     x, y, z = v
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
@@ -268,13 +267,10 @@ def compute_projected_gravity(quat: np.ndarray) -> np.ndarray:
     return gravity
 
 
-__all__ = ["compute_heading", "compute_minimum_jerk", "interpolate_poses"]
-
-
 def interpolate_poses(start: np.ndarray, end: np.ndarray, u: float) -> np.ndarray:
-    r"""Pose a fraction u of the way: linear, and :math:`q_0 \exp(u \log(q_0^{-1} q_1))`.
+    r"""Interpolate poses: linear, and :math:`q_0 \exp(u \log(q_0^{-1} q_1))`.
 
-    The turn takes the shorter arc, whichever signs the quaternions have.
+    The rotation takes the shorter arc, whatever the signs of the quaternions.
 
     Args:
         start: Poses at u = 0. Shape (..., 7).
@@ -290,7 +286,7 @@ def interpolate_poses(start: np.ndarray, end: np.ndarray, u: float) -> np.ndarra
 
 
 def compute_minimum_jerk(u: float) -> float:
-    """Fraction of a reach done at fraction u of its time: 10u³ − 15u⁴ + 6u⁵.
+    """Progress of a minimum-jerk motion at the fraction u of its duration: 10u³ − 15u⁴ + 6u⁵.
 
     Velocity and acceleration are zero at both ends; the peak speed is 1.875 times the mean.
 

@@ -1,4 +1,4 @@
-"""Versions of what decides how a recording comes out."""
+"""Versions of the packages that a recording depends on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _PACKAGES = ("lerobot_teleoperator_xop", "lerobot", "mujoco", "mink", "numpy", "
 
 @cache
 def read_versions() -> str:
-    """Versions of the packages that decide what is recorded, as one JSON object."""
+    """Versions of the packages that determine a recording, as a JSON object."""
     versions = {}
     for name in _PACKAGES:
         try:

@@ -1,8 +1,8 @@
-"""Words that YAML takes for something else: `off` is a boolean, `null` nothing, `007` a number.
+"""Text settings that YAML 1.1 reads as booleans, nulls or numbers: `off`, `null`, `007`.
 
-LeRobot reads flags and files of its commands as YAML 1.1, whose surprises reach a configuration
-as the text of what it was taken for: `--robot.sim.noise=off` comes in as "False". Files that this
-project reads itself are read by `load_yaml`, which takes words for words.
+LeRobot parses flags and files of its commands as YAML 1.1, so a text setting may arrive as the text
+of a converted value: `--robot.sim.noise=off` arrives as "False". The functions here recover the
+original text. Files of this project are read by `load_yaml`, by the rules of YAML 1.2.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Collection
 from typing import Any
 
 _NOTHING = ("false", "off", "no", "none", "null", "~")
-"""Words, and what YAML makes of them, for a setting that is switched off."""
+"""Words for a setting that is switched off, and their YAML values as text."""
 _NAMES_OF_NOTHING = ("off", "none")
 _CORE = (
     ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
@@ -27,18 +27,18 @@ _CORE = (
         "-+.0123456789",
     ),
 )
-"""What a plain scalar may be but text, by YAML 1.2: its pattern and how it may begin."""
+"""Types of plain scalars other than text in YAML 1.2: pattern and possible first characters."""
 
 
 def find_word(value: object, known: Collection[str]) -> str:
-    """Find which of the known names is meant by what YAML has made of it.
+    """Recover a name from its YAML value.
 
     Args:
-        value: The name; or what a word such as `off`, `no` or `null` was taken for.
-        known: Every name that is valid; `off` or `none` among them is what such words mean.
+        value: The name, or the YAML value of a word such as `off`, `no` or `null`.
+        known: All valid names; `off` or `none` among them is what such words mean.
 
     Returns:
-        The name; what is none comes back as text, for who checks it.
+        The name; any other value as text, for the caller to validate.
     """
     text = str(value)
     if text not in known and text.lower() in _NOTHING:
@@ -47,12 +47,12 @@ def find_word(value: object, known: Collection[str]) -> str:
 
 
 def find_text(value: str) -> str:
-    """Find the text of a setting that may be none: empty for `none`, `off` and their like."""
+    """Text of an optional setting: empty for `none`, `off` and similar words."""
     return "" if value.lower() in _NOTHING else value
 
 
 def fill_nulls(config: Any) -> None:
-    """Give the default to each field that must have a value and was given `null`.
+    """Set fields that must not be None, but were given `null`, to their defaults.
 
     Args:
         config: A dataclass, frozen or not, whose fields were read from YAML.
@@ -68,17 +68,17 @@ def fill_nulls(config: Any) -> None:
 
 
 def recover_typed(config: Any, flag: str, *names: str) -> None:
-    """Give free text back as it was typed, where YAML took it for a number or a switch.
+    """Restore text fields as typed if YAML converted them to a number or boolean.
 
-    A code of `012345` would be the octal number 5349 else. Only what stands on this process's
-    command line, and has become the very value of the field, is put in its place.
+    Otherwise a code of `012345` would become the octal number 5349. A field is restored only if
+    its value is the conversion of what is on this process's command line.
 
     Args:
-        config: A dataclass with fields of text.
-        flag: Flag of the configuration, `teleop.device`.
-        names: Its fields.
+        config: A dataclass with text fields.
+        flag: Flag of the configuration, such as `teleop.device`.
+        names: Its text fields.
     """
-    import yaml  # noqa: PLC0415 (only who has such a flag needs it)
+    import yaml  # noqa: PLC0415 (needed only for such a flag)
 
     for name in names:
         typed = _find_typed(f"--{flag}.{name}")
@@ -94,7 +94,7 @@ def recover_typed(config: Any, flag: str, *names: str) -> None:
 
 
 def _find_typed(flag: str) -> str | None:
-    """What stands after `flag` on the command line, the last time it is there."""
+    """Value of the last occurrence of `flag` on the command line; None without one."""
     found = None
     for word, after in zip(sys.argv, [*sys.argv[1:], None], strict=True):
         name, equals, text = word.partition("=")
@@ -104,21 +104,21 @@ def _find_typed(flag: str) -> str | None:
 
 
 def load_yaml(text: str, *, switches: bool = False) -> Any:
-    """Read YAML as its version 1.2 does, so that names and numbers are what they look like.
+    """Read YAML by the rules of version 1.2, which has fewer implicit conversions than 1.1.
 
     `off`, `on`, `yes` and `no`, `007`, `12:30` and dates are text; `1e-3` is a number.
 
     Args:
-        text: The YAML.
-        switches: Whether `on`, `off`, `yes` and `no` are booleans all the same.
+        text: The YAML text.
+        switches: Whether `on`, `off`, `yes` and `no` are booleans as in version 1.1.
 
     Raises:
-        yaml.YAMLError: If it is none.
+        yaml.YAMLError: If it is malformed.
     """
     import yaml  # noqa: PLC0415
 
     class Loader(yaml.SafeLoader):
-        """`yaml.SafeLoader` with other plain scalars."""
+        """`yaml.SafeLoader` with the plain scalars of YAML 1.2."""
 
     Loader.yaml_implicit_resolvers = {
         first: [(tag, pattern) for tag, pattern in rules if tag == "tag:yaml.org,2002:merge"]
@@ -130,4 +130,4 @@ def load_yaml(text: str, *, switches: bool = False) -> Any:
     if switches:
         words = re.compile(r"^(?:on|off|yes|no)$", re.IGNORECASE)
         Loader.add_implicit_resolver("tag:yaml.org,2002:bool", words, list("oOyYnN"))
-    return yaml.load(text, Loader)  # it is a safe loader
+    return yaml.load(text, Loader)  # a subclass of the safe loader
