@@ -1,1 +1,1 @@
-"""Measurements of the project by itself: `python -m benchmarks.run_…`; not installed."""
+"""Benchmarks of the project, `python -m benchmarks.run_…`; not part of the installed package."""

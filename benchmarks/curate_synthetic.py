@@ -1,8 +1,8 @@
-"""Datasets of made-up episodes without pictures, as large as one likes, to try tools on.
+"""Synthetic datasets of any size without images, to test dataset tools on.
 
-They have the features, the columns and the facts of recordings of a robot, and LeRobot loads them.
-The person walks to and fro and waves, the robot follows with an error, and by chance (the seed's)
-an episode fails, falls, or loses track of a hand for a while. There is no physics in them.
+They have the features, columns and facts of a robot's recordings, and LeRobot loads them. The
+person walks to and fro and waves, the robot follows with an error, and at random (seeded) an
+episode fails, falls, or loses the tracking of a hand for a while. No physics is simulated.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from xop_lerobot.session import RobotInfo
 
 TASK = "walk to and fro and wave"
 _SUCCEEDS, _FALLS, _LOSES = 0.7, 0.05, 0.1
-"""Chances that an episode succeeds, falls and loses track."""
+"""Probabilities that an episode succeeds, falls and loses tracking."""
 _DIGITS = 3
-"""Digits of the numbers: files of so many random ones would not be like those of recordings."""
+"""Decimals to which values are rounded: full-precision noise would compress unlike recordings."""
 
 
 def make_dataset(
     root: Path, episodes: int, frames: int, *, seed: int = 0, robot: str = "g1", fps: int = 25
 ) -> None:
-    """Make a dataset.
+    """Write a synthetic dataset.
 
     Args:
-        root: Its directory, which must not exist.
-        episodes: How many episodes it has.
-        frames: Frames of each.
-        seed: Seed of all that is random; episode i depends on it and on i alone.
+        root: Directory of the dataset, which must not exist.
+        episodes: Number of episodes.
+        frames: Frames per episode.
+        seed: Seed; episode i depends only on it and on i.
         robot: Name of the robot's morphology.
-        fps: Frames a second [Hz].
+        fps: Frame rate [Hz].
     """
     morphology = make_morphology(robot)
     name = f"xop_{robot}"
@@ -86,7 +86,7 @@ def make_dataset(
 
 
 def make_features(morphology: Morphology, robot: str, fps: int) -> dict[str, dict[str, Any]]:
-    """Make the features of a recording of a robot without cameras."""
+    """Return the LeRobot features of a recording without cameras."""
     info = RobotInfo(robot, morphology, morphology.policies[0], None, "empty", fps, 0)
     names = {"action": morphology.layout.keys, "observation.state": Body(morphology).state_keys}
     own = {
@@ -99,7 +99,7 @@ def make_features(morphology: Morphology, robot: str, fps: int) -> dict[str, dic
 def _make_pattern(
     features: dict[str, dict[str, Any]], frames: int, fps: int, seed: int
 ) -> dict[str, np.ndarray]:
-    """Make the columns of an episode in which all goes well, but for the counters."""
+    """Make the columns of a flawless episode, without the counters of `_count`."""
     rng = np.random.default_rng([seed, 0])
     t = np.arange(frames) / fps
     rows: dict[str, np.ndarray] = {}
@@ -131,7 +131,7 @@ def _make_pattern(
 def _vary(
     pattern: dict[str, np.ndarray], index: int, seed: int
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Make one episode of the pattern, and what is known of it as a whole."""
+    """Vary the pattern into one episode; returns its columns and its facts."""
     rng = np.random.default_rng([seed, 1, index])
     rows, frames = dict(pattern), len(pattern["action"])
     success, fallen, lost = rng.random(3) < (_SUCCEEDS, _FALLS, _LOSES)
@@ -173,7 +173,7 @@ def _vary(
 
 
 def _count(index: int, frames: int, fps: int) -> dict[str, np.ndarray]:
-    """Make the counters of episode `index`."""
+    """Make the timestamp and index columns of episode `index`."""
     numbers = np.arange(frames)
     return {
         "timestamp": (numbers / fps).astype(np.float32),
@@ -185,6 +185,7 @@ def _count(index: int, frames: int, fps: int) -> dict[str, np.ndarray]:
 
 
 def _make_table(rows: dict[str, np.ndarray], schema: pa.Schema) -> pa.Table:
+    """Make a table of `schema`; vectors become fixed-size lists without Python objects."""
     columns = []
     for field in schema:
         values = rows[field.name]

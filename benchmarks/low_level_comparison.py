@@ -1,4 +1,8 @@
-"""What G1 policies do alone: held commands, postures of the arms, random sequences, speed."""
+"""Measurements of G1's low-level policies without a retargeter.
+
+Held commands, held arm postures, random command sequences, the robot at rest, and the time of one
+call. Everything runs on the planning model, many robots at once.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
 
 SEQUENCES_SEED = 1_000_000
-"""Added to the seed, so that no sequence of a comparison was trained on."""
+"""Offset added to the seed, so that no policy was trained on a sequence of a comparison."""
 
 STAND, WALK = Mode.STATIONARY, Mode.MOBILE
 RESPONSES: dict[str, tuple[tuple[float, ...], Mode]] = {
@@ -43,7 +47,8 @@ RESPONSES: dict[str, tuple[tuple[float, ...], Mode]] = {
     "turn 0.6 rad/s": ((0.75, 0, 0, 0, 0, 0, 0.6), WALK),
     "walk 0.4 m/s at 0.60 m": ((0.60, 0, 0, 0, 0.4, 0, 0), WALK),
 }
-"""Plain commands, held for 10 s: name -> command, mode."""
+"""Held commands by name: (height [m], waist yaw, roll, pitch [rad], vx, vy [m/s], yaw rate [rad/s])
+and mode."""
 
 SEQUENCES = {
     "calm arms, no push": ExcitationConfig(arm_range=0.3, push=0.0),
@@ -53,7 +58,7 @@ SEQUENCES = {
         height=(0.45, 0.75), waist_roll=0.3, waist_pitch=(-0.3, 0.3), push=0.0, hand_force=20.0
     ),
 }
-"""Random sequences by name."""
+"""Ranges of the random sequences by name."""
 
 ARMS: dict[str, dict[str, float]] = {
     "palms up": {"wrist_roll": 1.9},
@@ -65,19 +70,28 @@ ARMS: dict[str, dict[str, float]] = {
     "crossed": {"shoulder_pitch": -0.8, "shoulder_yaw": 1.0, "elbow": 0.3},
     "to the sides": {"shoulder_roll": 1.5, "elbow": 1.4},
 }  # fmt: skip
-"""What people do with their arms: angles of the left arm [rad], from rest; the right mirrors it."""
+"""Arm postures that people take: joint angles of the left arm that differ from rest [rad]; the
+right arm mirrors them."""
 
 RAMP_S, HOLD_S, SETTLE_S = 1.5, 8.0, 0.8
+"""Times of `hold_arms`: ramp to the posture, the whole posture with its ramp, and settling before
+it [s]."""
 FAR = 0.1
-"""Distance from which a robot that was told to stand counts as having moved [m]."""
+"""Displacement above which a robot commanded to stand counts as having moved [m]."""
 SPEED = 0.4
-"""Forward velocity of the walks with held arms [m/s]."""
+"""Commanded forward velocity when walking with held arms [m/s]."""
 
 
 def make_simulation(
     n: int, threads: int = 2, policy: LowLevelPolicy | None = None
 ) -> BatchSimulation:
-    """Make `n` G1 in the planning model, at their standing posture, with a policy's motors."""
+    """Make `n` copies of G1's planning model in the standing posture.
+
+    Args:
+        n: Number of robots.
+        threads: Threads of the simulation.
+        policy: Policy whose motor gains the model gets, None for the model's own.
+    """
     morphology = make_morphology("g1")
     model = build_model(morphology, "planning")
     if policy is not None:
@@ -94,14 +108,14 @@ def measure_sequences(
     seconds: float = 20.0,
     threads: int = 2,
 ) -> TrialResult:
-    """Run random sequences.
+    """Run a policy on random sequences.
 
     Args:
         policy: The policy.
         config: Ranges of the sequences.
         seed: Seed of the sequences.
         trials: Number of sequences.
-        seconds: Length of each [s].
+        seconds: Duration of each [s].
         threads: Threads of the simulation.
     """
     rng = np.random.default_rng(SEQUENCES_SEED + seed)
@@ -117,8 +131,8 @@ def measure_responses(policy: LowLevelPolicy, threads: int = 2) -> dict[str, dic
     """Hold each command of `RESPONSES` for 10 s after a ramp of 1 s, arms at rest, no pushes.
 
     Returns:
-        By name: travel of the base [m] and turn [rad] since the ramp, mean height [m] and
-        velocities [m/s, rad/s] in the heading frame over the last 5 s, and falls.
+        By name: displacement [m] and rotation [rad] of the base since the ramp, mean height [m] and
+        velocities [m/s, rad/s] in the heading frame over the last 5 s, and falls (0 or 1).
     """
     n, steps, ramp, mean_steps = len(RESPONSES), 550, 50, 250
     final = np.array([command for command, _ in RESPONSES.values()])
@@ -162,16 +176,16 @@ REST_AXES: dict[str, tuple[float, ...]] = {
     "height": (0.42, 0.45, 0.50, 0.55, 0.60, 0.65, 0.70, 0.78),
     "waist_pitch": (-0.5, -0.3, -0.15, 0.0, 0.15, 0.3, 0.5),
 }
-"""Commands at which it is measured how a standing robot rests."""
+"""Grid of commands at which `measure_rest` measures a standing robot."""
 
 
 class MeasuredRest(NamedTuple):
-    """How standing robots rest, arms at rest; NaN where they fell.
+    """Posture of standing robots over a grid of commands, arms at rest; NaN where they fell.
 
     Attributes:
-        axes: Entries of the command and their values, those that the policy can do.
-        pitch: Pitch of the base [rad]. A row for each value of the first entry.
-        forward: Place of the base ahead of the middle of the feet [m], the same.
+        axes: Command entries and their grid values, clipped to what the policy can do.
+        pitch: Pitch of the base [rad]. One row per value of the first entry.
+        forward: Position of the base ahead of the centre of the feet [m]. Same shape.
     """
 
     axes: dict[str, tuple[float, ...]]
@@ -180,12 +194,13 @@ class MeasuredRest(NamedTuple):
 
 
 def measure_rest(policy: LowLevelPolicy, threads: int = 2) -> MeasuredRest:
-    """Measure how a policy's standing robot leans and moves its base unasked.
+    """Measure the uncommanded pitch and forward shift of a policy's standing robot.
 
-    Each command of a grid is approached in 3 s and held for 5 s; the mean of the last 2 s counts.
+    Each command of `REST_AXES` is approached in 3 s and held for 5 s; the result is the mean of
+    the last 2 s.
 
     Raises:
-        BadValue: If the policy has but one height, or does not pitch the waist.
+        BadValue: If the policy has a single height, or does not pitch the waist.
     """
     morphology = make_morphology("g1").fit(policy)
     space = morphology.command_space
@@ -229,7 +244,7 @@ def measure_rest(policy: LowLevelPolicy, threads: int = 2) -> MeasuredRest:
 
 
 class _SoleFinder:
-    """Finds a robot's feet."""
+    """Locates G1's feet by forward kinematics."""
 
     def __init__(self) -> None:
         morphology = make_morphology("g1")
@@ -238,7 +253,7 @@ class _SoleFinder:
         self._sites = [model.site(name).id for name in morphology.contact_points]
 
     def compute_forward(self, qpos: np.ndarray) -> float:
-        """Distance of the base ahead of the middle of the feet, along its heading [m]."""
+        """Return how far the base is ahead of the centre of the feet, along its heading [m]."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         middle = self._data.site_xpos[self._sites].mean(axis=0)
@@ -248,12 +263,14 @@ class _SoleFinder:
 
 @dataclass(frozen=True)
 class HeldArms:
-    """What has become of robots that hold their arms in a posture each.
+    """Outcome of `hold_arms`, one robot per arm posture.
 
     Attributes:
-        fell: Which fell. Shape (n,), bool.
-        travel: How far each is from where it stood [m], NaN if it fell. Shape (n,).
-        velocity: Mean velocity forward, left [m/s] and yaw rate [rad/s]. Shape (n, 3).
+        fell: Whether each robot fell. Shape (n,), bool.
+        travel: Displacement of the base since the start of the ramp [m], NaN if it fell.
+            Shape (n,).
+        velocity: Mean velocity forward, left [m/s] and yaw rate [rad/s] after the ramp.
+            Shape (n, 3).
     """
 
     fell: np.ndarray
@@ -262,12 +279,12 @@ class HeldArms:
 
     @property
     def strayed(self) -> np.ndarray:
-        """Which moved by more than `FAR`. Shape (n,), bool."""
+        """Whether each robot moved by more than `FAR` without a fall. Shape (n,), bool."""
         return ~self.fell & (self.travel > FAR)
 
 
 def make_named_arms() -> np.ndarray:
-    """The postures `ARMS`. Shape (len(ARMS), 14)."""
+    """Return the postures of `ARMS` as joint angles [rad]. Shape (len(ARMS), 14)."""
     morphology = make_morphology("g1")
     postures = np.tile(morphology.rest_action().arms, (len(ARMS), 1))
     for posture, angles in zip(postures, ARMS.values(), strict=True):
@@ -282,7 +299,14 @@ def make_named_arms() -> np.ndarray:
 def make_random_arms(
     policy: LowLevelPolicy, rng: np.random.Generator, n: int, span: float
 ) -> np.ndarray:
-    """Random postures over `span` of each joint's range, within the policy's limits. (n, 14)."""
+    """Draw arm postures uniformly [rad]. Shape (n, 14).
+
+    Args:
+        policy: The policy, to whose arm limits they are clipped.
+        rng: Random generator.
+        n: Number of postures.
+        span: Fraction of each joint's range, about its centre.
+    """
     joints, names = read_joints("g1"), make_morphology("g1").arm_names
     low, high = joints.low[joints.arms], joints.high[joints.arms]
     arms = (low + high) / 2 + span * (high - low) / 2 * rng.uniform(-1, 1, (n, len(low)))
@@ -295,11 +319,11 @@ def make_random_arms(
 def hold_arms(
     policy: LowLevelPolicy, arms: np.ndarray, mode: Mode, height: float = 0.75, threads: int = 2
 ) -> HeldArms:
-    """Stand or walk with the arms in a posture each: 1.5 s on the way there, 8 s in all.
+    """Stand or walk with held arm postures, one robot each: a ramp of 1.5 s, 8 s in all.
 
     Args:
         policy: The policy.
-        arms: Postures. Shape (n, 14).
+        arms: Joint angles of the arms [rad]. Shape (n, 14).
         mode: Stationary to stand, mobile to walk at `SPEED`.
         height: Commanded height of the pelvis [m].
         threads: Threads of the simulation.
@@ -307,6 +331,7 @@ def hold_arms(
     n, rest = len(arms), make_morphology("g1").rest_action().arms
     final = np.array([height, 0, 0, 0, SPEED * (mode is Mode.MOBILE), 0, 0])
     settle, ramp = round(SETTLE_S / POLICY_DT), round(RAMP_S / POLICY_DT)
+    # The height is reached first, at 0.25 m/s; displacement counts from there.
     lead = settle + round(abs(height - 0.75) / 0.25 / POLICY_DT)
     simulation = make_simulation(n, threads, policy)
     memory, up = policy.initial_memory(n), np.ones(n, bool)
@@ -336,7 +361,7 @@ def measure_speeds(
 ) -> dict[str, dict[str, float]]:
     """Measure the median time of one `act` [ms], by policy and batch size.
 
-    The policies take turns, so that whatever else the machine does slows all of them.
+    The policies are called alternately, so that other load on the machine slows all of them alike.
     """
     qpos = make_morphology("g1").standing_qpos()
     result: dict[str, dict[str, float]] = {name: {} for name in policies}
@@ -360,12 +385,12 @@ def measure_speeds(
 
 
 def replace_table(page: Path, table: str, mark: str) -> None:
-    """Replace what stands between the two marks of a Markdown page by `table`.
+    """Replace the text between two markers of a Markdown page by `table`.
 
-    The marks are the comments ``mark`` and ``end of mark``.
+    The markers are the HTML comments ``<!-- mark -->`` and ``<!-- end of mark -->``.
 
     Raises:
-        BadValue: If the page does not have the marks.
+        BadValue: If the page does not have each marker once.
     """
     begin, end = f"<!-- {mark} -->\n", f"<!-- end of {mark} -->"
     text = page.read_text(encoding="utf-8")

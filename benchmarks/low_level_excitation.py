@@ -1,4 +1,8 @@
-"""Random commands, arm motions and pushes, on which G1 policies are trained and compared."""
+"""Random commands, arm motions and pushes for training and comparing G1's low-level policies.
+
+Any change of the order or number of random draws changes the published comparison
+(docs/results/low_level_policies.md).
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,9 @@ from xop_lerobot.low_level.joints import read_joints
 from xop_lerobot.low_level.policy import POLICY_DT
 
 HEIGHT_NEUTRAL = 0.75
+"""Neutral height of G1's pelvis [m]."""
 VELOCITIES = slice(4, 7)
+"""Velocity entries of G1's command."""
 
 
 @dataclass(frozen=True)
@@ -19,18 +25,18 @@ class ExcitationConfig:
     """Ranges of the random sequences; the defaults are those of the published comparison.
 
     Attributes:
-        height: Base height in stance [m].
-        waist_yaw: Largest waist yaw [rad].
-        waist_roll: Largest waist roll [rad].
-        waist_pitch: Waist pitch [rad].
-        vx: Largest forward velocity [m/s].
-        vy: Largest lateral velocity [m/s].
-        yaw_rate: Largest yaw rate [rad/s].
-        arm_range: Part of each arm joint's range that is used, about its middle.
-        arm_speed: Largest speed of the arm targets [rad/s].
-        push: Largest change of the base's planar velocity by a push [m/s].
+        height: Range of the base height in stance [m].
+        waist_yaw: Maximum waist yaw [rad].
+        waist_roll: Maximum waist roll [rad].
+        waist_pitch: Range of the waist pitch [rad].
+        vx: Maximum forward velocity [m/s].
+        vy: Maximum lateral velocity [m/s].
+        yaw_rate: Maximum yaw rate [rad/s].
+        arm_range: Fraction of each arm joint's range that is used, about its centre.
+        arm_speed: Maximum speed of the arm targets [rad/s].
+        push: Maximum change of the base's planar velocity by a push [m/s].
         push_period: Mean time between pushes [s].
-        hand_force: Largest force on each hand and axis [N].
+        hand_force: Maximum force on each hand along each axis [N].
     """
 
     height: tuple[float, float] = (0.5, 0.75)
@@ -72,7 +78,7 @@ def make_excitation(
     """Draw random sequences: targets held for some seconds, reached by steps or ramps.
 
     Args:
-        rng: Source of chance.
+        rng: Random generator.
         n: Number of robots.
         steps: Policy steps of 20 ms.
         config: Ranges.
@@ -85,11 +91,13 @@ def make_excitation(
     neutral = np.array([HEIGHT_NEUTRAL, 0, 0, 0, 0, 0, 0])
     neutral[0] = min(neutral[0], config.height[1])
     target = low + (high - low) * _hold(rng, n, steps, (1.0, 5.0), low.size)
+    # Each entry stays neutral 40 % of the time.
     keep = _hold(rng, n, steps, (1.0, 5.0), low.size) < 0.6
     target = np.where(keep, target, neutral)
     target[..., VELOCITIES] *= (mode == Mode.MOBILE)[..., None]
     slow = np.array([0.05, 0.3, 0.2, 0.2, 0.5, 0.5, 0.5])
     fast = np.array([0.5, 3.0, 1.0, 1.0, 5.0, 5.0, 5.0])
+    # Log-uniform between a slow ramp and nearly a step.
     rate = slow * (fast / slow) ** _hold(rng, n, steps, (1.0, 5.0), low.size)
     command = _follow(target, rate, np.tile(neutral, (n, 1)))
     arms = _make_arms(rng, n, steps, config)
@@ -102,7 +110,7 @@ def make_excitation(
 def _hold(
     rng: np.random.Generator, n: int, steps: int, seconds: tuple[float, float], size: int = 1
 ) -> np.ndarray:
-    """Uniform numbers in [0, 1), each held for a random time. Shape (steps, n, size)."""
+    """Draw uniform numbers in [0, 1), each held for a random time. Shape (steps, n, size)."""
     values = np.empty((steps, n, size))
     for robot in range(n):
         for channel in range(size):
@@ -115,7 +123,7 @@ def _hold(
 
 
 def _follow(target: np.ndarray, rate: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Follow `target` with at most `rate` per second, from `start`. Shape (steps, n, k)."""
+    """Limit the rate of `target` to `rate` per second, from `start`. Shape (steps, n, k)."""
     path, now = np.empty_like(target), start
     for step in range(len(target)):
         limit = rate[step] * POLICY_DT
@@ -138,7 +146,7 @@ def _make_arms(
     path = _follow(target, rate, np.zeros((n, len(low))))
     smooth = np.empty_like(path)
     now = path[0]
-    for step in range(steps):  # no corners: a first-order lag of 0.1 s
+    for step in range(steps):  # a first-order lag of 0.1 s rounds the corners of the ramps
         now = now + (path[step] - now) * (POLICY_DT / 0.1)
         smooth[step] = now
     return smooth

@@ -1,4 +1,4 @@
-"""Closed-loop trials of G1 policies: many robots at once, falls and tracking errors."""
+"""Closed-loop trials of G1's low-level policies: many robots at once, falls and tracking errors."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from xop_lerobot.core.transforms import compute_projected_gravity, quat_rotate, 
 from xop_lerobot.low_level.policy import POLICY_DT, LowLevelPolicy
 
 FALL_HEIGHT = 0.35
-"""Base height under which a robot counts as fallen [m]."""
+"""Base height below which a robot counts as fallen [m]."""
 FALL_TILT = 0.8
-"""Tilt of the base over which a robot counts as fallen [rad]."""
+"""Tilt of the base above which a robot counts as fallen [rad]."""
 
 
 class BatchSimulation:
     """Copies of a robot stepped together by `mujoco.rollout`.
 
     Args:
-        models: The model of each copy, all of the same structure.
+        models: One model per copy, all of the same structure.
         start: Generalised position after a reset. Shape (nq,).
-        threads: Threads that step.
+        threads: Threads of the simulation.
         hands: Bodies on which hand forces act.
     """
 
@@ -67,7 +67,7 @@ class BatchSimulation:
         self.qvel[:, :2] += change
 
     def step(self, targets: np.ndarray, hand_force: np.ndarray | None = None) -> None:
-        """Let 20 ms pass.
+        """Advance all robots by one policy step of 20 ms.
 
         Args:
             targets: Motor targets. Shape (n, nu).
@@ -90,13 +90,13 @@ class BatchSimulation:
         self.state = np.array(states)[:, -1].copy()
 
     def fallen(self) -> np.ndarray:
-        """Tell which robots have fallen. Shape (n,), bool."""
+        """Return which robots are too low, too tilted or not finite. Shape (n,), bool."""
         upright = -compute_projected_gravity(self.qpos[:, 3:7])[:, 2]
         low = self.qpos[:, 2] < FALL_HEIGHT
         return low | (upright < np.cos(FALL_TILT)) | ~np.isfinite(self.state).all(axis=1)
 
     def velocity(self) -> np.ndarray:
-        """Velocity in the heading frame: vx, vy [m/s], yaw rate [rad/s]. Shape (n, 3)."""
+        """Return the velocity in the heading frame: vx, vy [m/s], yaw rate [rad/s]. (n, 3)."""
         yaw = quat_yaw(self.qpos[:, 3:7])
         cos, sin = np.cos(yaw), np.sin(yaw)
         vx, vy = self.qvel[:, 0], self.qvel[:, 1]
@@ -110,19 +110,19 @@ class BatchSimulation:
 
 @dataclass(frozen=True)
 class TrialResult:
-    """Outcome of a batch of trials; errors are over the time before a fall.
+    """Outcome of a batch of trials; errors cover the time before a fall.
 
     Attributes:
         trials: Number of trials.
-        seconds: Length of each [s].
-        falls: Trials that ended in a fall.
-        height_rmse: Base height against the command, in stance [m].
-        vx_rmse: Forward velocity against the command, walking [m/s].
-        vy_rmse: Lateral velocity against the command, walking [m/s].
-        planar_rmse: Both of these together [m/s].
-        yaw_rate_rmse: Yaw rate against the command, walking [rad/s].
-        waist_yaw_rmse: Waist yaw against the command, in stance [rad].
-        stance_drift: Median path speed of the base in stance [m/s].
+        seconds: Duration of each [s].
+        falls: Number of trials that ended in a fall.
+        height_rmse: RMS error of the base height in stance [m].
+        vx_rmse: RMS error of the forward velocity when walking [m/s].
+        vy_rmse: RMS error of the lateral velocity when walking [m/s].
+        planar_rmse: RMS error of the planar velocity when walking, √(vx² + vy²) [m/s].
+        yaw_rate_rmse: RMS error of the yaw rate when walking [rad/s].
+        waist_yaw_rmse: RMS error of the waist yaw in stance [rad].
+        stance_drift: Median planar speed of the base in stance [m/s].
     """
 
     trials: int
@@ -140,7 +140,7 @@ class TrialResult:
 def run_trials(
     policy: LowLevelPolicy, simulation: BatchSimulation, excitation: Excitation
 ) -> TrialResult:
-    """Run `policy` on every sequence of `excitation`, one robot each, and judge it."""
+    """Run `policy` on every sequence of `excitation`, one robot each, and compute its errors."""
     steps, n, _ = excitation.command.shape
     simulation.reset(np.ones(n, bool))
     memory, up = policy.initial_memory(n), np.ones(n, bool)
@@ -155,7 +155,7 @@ def run_trials(
         simulation.step(targets, excitation.hand_force[step])
         down = simulation.fallen()
         up &= ~down
-        simulation.reset(~up)  # a fallen robot stays out, at rest, and costs little
+        simulation.reset(~up)  # a fallen robot no longer counts, and is cheap to step at rest
         velocity = simulation.velocity()
         error[step, up, 0] = (simulation.qpos[:, 2] - command[:, 0])[up]
         error[step, up, 1:4] = (velocity - command[:, 4:7])[up]

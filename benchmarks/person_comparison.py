@@ -1,4 +1,4 @@
-"""How a person moves, in figures: the same of recorded people and of the simulated one."""
+"""Motion statistics of recorded people and of the simulated person, computed alike."""
 
 from __future__ import annotations
 
@@ -16,11 +16,9 @@ from xop_lerobot.tasks.person.hands import compute_reach_time
 from xop_lerobot.tasks.person.mind import Mind
 
 RATE = 60.0
-"""Rate at which motions are compared [Hz]."""
+"""Rate to which motions are resampled [Hz]."""
 SMOOTH_S = 0.1
 """Window over which positions are averaged before they are differentiated [s]."""
-STILL = 0.15
-"""Speed of the head below which a person stands [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +26,12 @@ class Motion:
     """Motion of one person, evenly sampled.
 
     Attributes:
-        name: Whose it is.
+        name: Name of the recording or of the simulated person.
         simulated: Whether the person is simulated.
         time: Time [s]. Shape (n,).
         head: Position of the head [m]. Shape (n, 3).
         turns: Angular speed of the head [rad/s]. Shape (n,).
-        hands: Wrists from the head, axes of the room [m]. Shape (2, n, 3).
+        hands: Positions of the wrists relative to the head, axes of the room [m]. Shape (2, n, 3).
     """
 
     name: str
@@ -45,11 +43,11 @@ class Motion:
 
     @property
     def speeds(self) -> Mapping[str, np.ndarray]:
-        """Speed of the head, and of the hands in the room [m/s]. Shapes (n,)."""
+        """Speeds of the head and of the hands in the room [m/s]. Shapes (n,)."""
         named = {"head": self.head}
         for side, hand in zip(SIDES, self.hands, strict=True):
             named[f"{side} hand"] = self.head + hand
-        return {name: np.linalg.norm(_differentiate(way), axis=1) for name, way in named.items()}
+        return {name: np.linalg.norm(_differentiate(path), axis=1) for name, path in named.items()}
 
 
 def load_motion(path: Path) -> Motion:
@@ -66,26 +64,26 @@ def load_motion(path: Path) -> Motion:
 
 
 def simulate_motion(seed: int, duration: float = 30.0) -> Motion:
-    """A simulated person who stands, walks, turns and reaches by chance, alone in the room."""
+    """Simulate a person who stands, walks, turns and reaches at random, without a robot."""
     frames = list(simulate_frames(seed, duration))
     return _make_motion(f"simulated {seed}", frames, simulated=True)
 
 
 def simulate_frames(seed: int, duration: float, rate: float = RATE) -> Iterator[OperatorFrame]:
-    """Frames of the same person, `rate` of them in a second [Hz]."""
+    """Yield the frames of that person at `rate` [Hz]."""
     mind = Mind(seed)
     body, rng = mind.body, np.random.default_rng((seed, 9))
     resting = 0.0
     for time in np.arange(0, duration, 1 / rate):
         body.advance(float(time))
         if not body.is_moving and time >= resting:
-            _move_by_chance(mind, body, rng)
+            _move_at_random(mind, body, rng)
             resting = time + float(rng.uniform(0.3, 3.0))
         yield body.make_frame(float(time))
 
 
-def _move_by_chance(mind: Mind, body: Body, rng: np.random.Generator) -> None:
-    """Begin to walk a step or two, or to reach for something."""
+def _move_at_random(mind: Mind, body: Body, rng: np.random.Generator) -> None:
+    """Begin a walk of a step or two, or a reach of one hand."""
     posture = body.posture
     if rng.random() < 0.5:
         from dataclasses import replace  # noqa: PLC0415
@@ -95,15 +93,15 @@ def _move_by_chance(mind: Mind, body: Body, rng: np.random.Generator) -> None:
         return
     room = body.compute_hands_in_room()
     side = int(rng.integers(2))
-    way = rng.uniform(-0.25, 0.25, 3)
+    offset = rng.uniform(-0.25, 0.25, 3)
     goal = room[side].copy()
-    goal[:3] += way
-    duration = compute_reach_time(mind, float(np.linalg.norm(way)))
+    goal[:3] += offset
+    duration = compute_reach_time(mind, float(np.linalg.norm(offset)))
     body.move(body.with_hands_in_room(posture, {SIDES[side]: goal}), duration)
 
 
 def compute_figures(motion: Motion) -> dict[str, float]:
-    """Medians, 95th percentiles and jerks of head and hands, by name with the unit."""
+    """Compute medians, 95th percentiles and jerks of head and hands, by name with unit."""
     speeds = motion.speeds
     hands = np.concatenate([speeds[f"{side} hand"] for side in SIDES])
     reach = np.concatenate([np.linalg.norm(_differentiate(hand), axis=1) for hand in motion.hands])
@@ -121,10 +119,10 @@ def compute_figures(motion: Motion) -> dict[str, float]:
 
 
 def compute_spectrum(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Power of the head's velocity over frequency, all three axes together.
+    """Compute the power spectral density of the head's velocity, summed over the three axes.
 
     Returns:
-        Frequencies [Hz], and power [m²/s²/Hz]. Shapes (k,).
+        Frequencies without zero [Hz], and the one-sided density [m²/s²/Hz]. Shapes (k,).
     """
     velocity = np.gradient(motion.head, 1 / RATE, axis=0)
     window = np.hanning(len(velocity))[:, None]
@@ -144,7 +142,7 @@ def _make_motion(name: str, frames: list[OperatorFrame], *, simulated: bool) -> 
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
-    """Moving average over `SMOOTH_S`; the ends are held. Shape (n, ...)."""
+    """Return the moving average over `SMOOTH_S`, with the end values repeated. Shape (n, d)."""
     size = max(1, round(SMOOTH_S * RATE)) | 1
     padded = np.pad(values, ((size // 2, size // 2), (0, 0)), mode="edge")
     kernel = np.ones(size) / size
@@ -155,7 +153,7 @@ def _differentiate(values: np.ndarray) -> np.ndarray:
     return np.gradient(_smooth(values), 1 / RATE, axis=0)
 
 
-def _compute_jerk(way: np.ndarray) -> float:
-    """RMS of the third derivative of a smoothed way [m/s³]."""
-    jerk = np.diff(_smooth(_smooth(way)), n=3, axis=0) * RATE**3
+def _compute_jerk(path: np.ndarray) -> float:
+    """Compute the RMS of the third derivative of a path smoothed twice [m/s³]."""
+    jerk = np.diff(_smooth(_smooth(path)), n=3, axis=0) * RATE**3
     return float(np.sqrt((jerk**2).sum(axis=1).mean()))

@@ -1,4 +1,4 @@
-"""The planner's own time, beside that of pytorch_mppi's KMPPI on the same system."""
+"""Time of the planner alone, compared with pytorch_mppi's KMPPI on the same system."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.kmppi import Kmppi
 
 ENTRIES = 7
+"""Entries of a command, as many as G1 has."""
 CASES = ((30, 3, 1), (30, 3, 3), (30, 5, 2), (30, 10, 5), (128, 3, 1), (128, 10, 5))
-"""Samples K, steps T and support points S; S = T // 2 is pytorch_mppi's default."""
+"""Samples K, steps T and support points S of each row; S = T // 2 is pytorch_mppi's default."""
 
 BLOCK = 20
-"""Solves of one planner before the other has its turn."""
+"""Consecutive solves of one planner before the other is timed."""
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -30,7 +31,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "importance_cost": True,
     },
 }
-"""Ours with its defaults, and in the setting in which it equals the other one."""
+"""Settings of our planner: its defaults, and those with which it equals pytorch_mppi's KMPPI."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +39,13 @@ class PlannerTime:
     """Time of one solve without physics and policy, medians over interleaved blocks.
 
     Attributes:
-        setting: Which of `SETTINGS`.
+        setting: Name in `SETTINGS`.
         samples: Number of samples K.
         horizon: Number of steps T.
         knots: Number of support points S.
         ours_us: Ours: shift, sample, update, and reading the command [µs].
         theirs_us: `command()` of pytorch_mppi's KMPPI [µs].
-        theirs_without_rollouts_us: The same less what it spends in its rollouts, which only
-            count steps here [µs].
+        theirs_without_rollouts_us: The same less the time of its rollouts [µs].
     """
 
     setting: str
@@ -58,24 +58,24 @@ class PlannerTime:
 
     @property
     def ratio(self) -> float:
-        """How many times faster ours is than their whole command."""
+        """Time of their whole `command()` over ours."""
         return self.theirs_us / self.ours_us
 
     @property
     def ratio_without_rollouts(self) -> float:
-        """How many times faster ours is than their command less its rollouts."""
+        """Time of their `command()` less its rollouts over ours."""
         return self.theirs_without_rollouts_us / self.ours_us
 
 
 def measure_planners(
     cases: Sequence[tuple[int, int, int]] = CASES, repeats: int = 300, seed: int = 0
 ) -> list[PlannerTime]:
-    """Time both planners on one thread, on a system that does nothing.
+    """Time both planners on one thread, on a system with constant state.
 
-    The state stays and the cost of a step is an entry of the state, another one per sample, so
-    what is left is the planner: shift, noise, interpolation, weights and update. Both planners
-    take turns of `BLOCK` solves, so that a busy machine slows both; the first solves of a turn,
-    which find the other's code in the caches, do not count.
+    The cost of a step is an entry of the state, which differs between samples, so what is left is
+    the planner: shift, noise, interpolation, weights and update. Blocks of `BLOCK` solves
+    alternate, so that other load on the machine slows both; the first three solves of a block,
+    which find the other planner's code in the caches, do not count.
 
     Args:
         cases: Samples, steps and support points of each row.
@@ -112,14 +112,14 @@ def _measure(
 
 
 def _time(solve: Callable[[], float]) -> tuple[float, float]:
-    """Time of one solve, and what it says it spent in its rollouts [s]."""
+    """Return the time of one solve and the part of it spent in rollouts [s]."""
     start = perf_counter()
     rollout = solve()
     return perf_counter() - start, rollout
 
 
 def _step(state: Any, command: Any) -> Any:
-    """Dynamics that do nothing, for arrays of numpy and of torch."""
+    """Return the state unchanged; for arrays of numpy and of torch."""
     return state
 
 
@@ -130,7 +130,7 @@ def _cost(state: Any, command: Any) -> Any:
 def make_ours(
     setting: str, samples: int, horizon: int, knots: int, seed: int
 ) -> Callable[[], float]:
-    """Make a function that does one solve of our planner and returns its rollouts' time [s]."""
+    """Return a function that solves once with our planner and returns its rollouts' time [s]."""
     config = MpcConfig(
         num_samples=samples,
         horizon=horizon,
@@ -143,7 +143,7 @@ def make_ours(
     planner.reset(np.zeros(ENTRIES))
     rng = np.random.default_rng(seed)
     noise, candidates = np.full(ENTRIES, 0.1), np.zeros((0, ENTRIES))
-    # One state per sample, so that costs differ and the search for the weights is a real one.
+    # One state per sample, so that costs differ and the temperature search has work to do.
     start = rng.standard_normal((samples, ENTRIES))
 
     def solve() -> float:
@@ -157,14 +157,14 @@ def make_ours(
             costs += _cost(state, command)
         end = perf_counter()
         planner.update(drawn, costs)
-        planner.commands  # noqa: B018  (what a robot would be sent)
+        planner.commands  # noqa: B018  (lazily interpolated: part of what a robot would wait for)
         return end - begin
 
     return solve
 
 
 def make_theirs(samples: int, horizon: int, knots: int, seed: int) -> Callable[[], float]:
-    """Make a function that does one solve of pytorch_mppi's KMPPI, as `make_ours`."""
+    """Return a function that solves once with pytorch_mppi's KMPPI, as `make_ours` does."""
     import torch  # noqa: PLC0415
     from pytorch_mppi.mppi import KMPPI, RBFKernel  # noqa: PLC0415
 
@@ -204,7 +204,7 @@ def make_theirs(samples: int, horizon: int, knots: int, seed: int) -> Callable[[
 
 
 def make_planner_table(times: Sequence[PlannerTime]) -> str:
-    """Make a Markdown table of `times`."""
+    """Format `times` as a Markdown table."""
     lines = [
         "| K × T, S | setting | ours [µs] | KMPPI [µs] | ratio | less rollouts [µs] | ratio |",
         "|---|---|---|---|---|---|---|",

@@ -1,7 +1,7 @@
-"""How near a policy's hands come to their points, from what `lerobot-rollout` recorded.
+"""Distance of a policy's palms from their target points, from datasets of `lerobot-rollout`.
 
-The points are not in a dataset, as no policy may see them. But an episode's seed decides where they
-are, so they are placed once more, and compared with the true poses of the hands (`robot.*`).
+A dataset does not contain the points, as no policy may see them. They are placed again from the
+episodes' seeds and compared with the true poses of the hands (`robot.*`).
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ if TYPE_CHECKING:
 
 SIDES = ("left", "right")
 WINDOW_S = 0.5
-"""An error is a mean over the last so much before the time that is asked for [s]."""
+"""Window before the evaluated time over which an error is averaged [s]."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What was simulated in a session: all that decides where the points are.
+    """Simulation settings of a session, which determine where the points are.
 
     Attributes:
         robot: Name of the morphology.
         task: Name of the task.
-        scene: Scene that the robot stood in.
-        noise: Preset of the sensors' noise.
+        scene: Name of the scene.
+        noise: Preset of the sensor noise.
         low_level: Low-level policy.
         fps: Rate of the control loop [Hz].
         seed: Seed of the session.
-        heights: Heights over the task's usual ones.
+        heights: Override of the task's heights, as in the robot's `task_heights`; empty for none.
     """
 
     robot: str
@@ -59,13 +59,13 @@ class Setting:
 
 @dataclass(frozen=True)
 class Hands:
-    """Both palms of some episodes, and the points that they were to be at.
+    """Palm positions over several episodes, and their target points, in the world frame.
 
     Attributes:
         setting: What was simulated.
         episodes: Indices of the episodes. Shape (n,).
-        palms: Position of the left and the right palm in each frame [m]. Shape (n, frames, 2, 3).
-        points: Position of their points [m]. Shape (n, 2, 3).
+        palms: Positions of the left and the right palm in each frame [m]. Shape (n, frames, 2, 3).
+        points: Positions of their target points [m]. Shape (n, 2, 3).
         success: Whether the task was accomplished within these frames. Shape (n,).
         fallen: Whether the robot fell in the episode. Shape (n,).
     """
@@ -78,20 +78,20 @@ class Hands:
     fallen: np.ndarray
 
     def compute_errors(self, window_s: float = WINDOW_S) -> np.ndarray:
-        """Distance of the palms from their points, mean over both and over the last `window_s`.
+        """Compute the palms' distances from their points, mean over both and the last `window_s`.
 
         Returns:
-            One for each episode [m]. Shape (n,).
+            Distance per episode [m]. Shape (n,).
         """
         return self._compute(self.points, window_s)
 
     def compute_errors_elsewhere(self, window_s: float = WINDOW_S) -> np.ndarray:
-        """The same, from the points of the *other* episodes: mean over all of them.
+        """Compute the mean distance from the points of all *other* episodes.
 
-        Who does not look comes as near to these as to its own.
+        A policy that ignores its images comes as near to these as to its own.
 
         Returns:
-            One for each episode [m]. Shape (n,).
+            Distance per episode [m]. Shape (n,).
         """
         n = len(self.points)
         shifted = [self._compute(np.roll(self.points, k, axis=0), window_s) for k in range(1, n)]
@@ -104,14 +104,15 @@ class Hands:
 
 
 def read_hands(root: Path, at: float) -> Hands:
-    """Read the hands of a dataset, up to `at` [s] of each episode.
+    """Read the palms of a dataset, up to `at` [s] of each episode.
 
     Args:
         root: A dataset of a simulated robot of this project, with `robot.*` columns.
-        at: Time after the episode's first frame at which it is judged [s].
+        at: Time after an episode's first frame at which it is evaluated [s].
 
     Raises:
-        BadDataset: If it has no such columns, no facts or no points, or an episode is shorter.
+        BadDataset: If the dataset has no such columns or no facts, or an episode is shorter.
+        BadValue: If the task has no points.
     """
     with Source(root) as source:
         setting = _read_setting(source)
@@ -150,12 +151,12 @@ def read_hands(root: Path, at: float) -> Hands:
 
 
 def stand_still(setting: Setting, episodes: Sequence[int], at: float) -> Hands:
-    """Let the robot stand where it is, in the same episodes: the policy that does nothing.
+    """Simulate the same episodes with a robot that holds its start posture: the null policy.
 
     Args:
         setting: What is simulated.
         episodes: Indices of the episodes.
-        at: For how long [s].
+        at: Simulated time [s].
     """
     stage = _make_stage(setting)
     sites = find_palms(stage.morphology, stage.plant.model)
@@ -168,12 +169,13 @@ def stand_still(setting: Setting, episodes: Sequence[int], at: float) -> Hands:
             loop.reset(seed, start=stage.start)
             stage.reset(seed)
             points.append(_get_points(stage))
-            way = []
+            path = []
             for _ in range(frames):
-                way.append([stage.plant.get_site_pose(sites[f"{side}_palm"])[:3] for side in SIDES])
+                place = [stage.plant.get_site_pose(sites[f"{side}_palm"])[:3] for side in SIDES]
+                path.append(place)
                 loop.execute(stage.start, 1 / setting.fps)
                 stage.update()
-            palms.append(way)
+            palms.append(path)
             success.append(stage.status.success)
             fallen.append(loop.state.fallen)
     finally:
@@ -190,13 +192,13 @@ def stand_still(setting: Setting, episodes: Sequence[int], at: float) -> Hands:
 
 
 def compute_best_blind_error(points: np.ndarray) -> float:
-    """Least mean distance that hands reach which go to the same places in each episode.
+    """Compute the least mean distance of hands that go to the same two places in each episode.
 
-    It is found with hindsight: the places are the points' geometric medians, by Weiszfeld's
-    iteration. No policy that does not look can do better on these episodes.
+    The places are found in hindsight, as the points' geometric medians, by Weiszfeld's iteration.
+    No policy that ignores its images can do better on these episodes.
 
     Args:
-        points: Of the left and the right palm [m]. Shape (n, 2, 3).
+        points: Target points of the left and the right palm [m]. Shape (n, 2, 3).
 
     Returns:
         The distance, mean over both hands and all episodes [m].
@@ -210,13 +212,13 @@ def compute_best_blind_error(points: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Margin:
-    """By how much one is nearer than another, in the same episodes.
+    """Paired difference between the errors of two policies in the same episodes.
 
     Attributes:
-        mean: Mean of the differences; positive where the first is nearer [m].
-        interval: Its 95% bootstrap interval over episodes [m].
-        nearer: In how many episodes the first is nearer.
-        episodes: Of how many.
+        mean: Mean of the differences; positive if the first is nearer [m].
+        interval: 95% bootstrap interval of the mean over episodes [m].
+        nearer: Number of episodes in which the first is nearer.
+        episodes: Number of episodes.
     """
 
     mean: float
@@ -226,10 +228,14 @@ class Margin:
 
 
 def compute_margin(first: np.ndarray, second: np.ndarray) -> Margin:
-    """Compare the errors of two, episode by episode.
+    """Compare the errors of two policies, episode by episode.
+
+    Args:
+        first: Errors of the first [m]. Shape (n,).
+        second: Errors of the second [m]. Shape (n,).
 
     Raises:
-        BadValue: If they are not of equally many episodes.
+        BadValue: If the numbers of episodes differ.
     """
     if first.shape != second.shape:
         raise BadValue(f"errors of {first.size} and of {second.size} episodes cannot be compared")
@@ -243,7 +249,7 @@ def compute_margin(first: np.ndarray, second: np.ndarray) -> Margin:
 
 
 def make_episode_seed(seed: int, episode: int) -> int:
-    """Seed of an episode, as the robot makes it of its session's seed."""
+    """Derive an episode's seed from its session's, as the robot does."""
     return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 
@@ -252,7 +258,7 @@ def _read_setting(source: Source) -> Setting:
     robot: dict[str, Any] = source.read_config().get("robot", {})
     facts = read_facts(source.root)
     if not facts or not robot.get("task"):
-        raise BadDataset(source.root, "it does not say which task was simulated (meta/xop)")
+        raise BadDataset(source.root, "meta/xop does not name the simulated task")
     sensors = robot.get("sim", {})
     return Setting(
         robot=str(robot["type"]).removeprefix("xop_"),
@@ -271,7 +277,7 @@ def _check_length(source: Source, entry: EpisodeEntry, frames: int) -> None:
         length = entry.length / source.fps
         raise BadDataset(
             source.root,
-            f"episode {entry.index} ends after {length:.2f} s, and is to be judged at "
+            f"episode {entry.index} ends after {length:.2f} s, but is to be judged at "
             f"{frames / source.fps:.2f} s",
         )
 
@@ -282,26 +288,30 @@ def _make_stage(setting: Setting) -> Stage:
 
 
 def _find_offsets(stage: Stage) -> list[np.ndarray]:
-    """Pose of each palm in its wrist's frame, which are one rigid body. Shapes (7,)."""
+    """Return the pose of each palm in its wrist's frame. Shapes (7,).
+
+    Raises:
+        BadValue: If a palm and its wrist are not on one rigid body.
+    """
     model, frames = stage.plant.model, stage.morphology.frames
     palms = find_palms(stage.morphology, model)
     offsets = []
     for side in SIDES:
         wrist, palm = frames[f"{side}_wrist"], palms[f"{side}_palm"]
         if model.site(wrist).bodyid[0] != model.site(palm).bodyid[0]:
-            raise BadValue(f"{palm} does not move with {wrist}, so where it was is not known")
+            raise BadValue(f"{palm} is not fixed to {wrist}, so its recorded pose is unknown")
         at_wrist, at_palm = (stage.plant.get_site_pose(site) for site in (wrist, palm))
         offsets.append(pose_multiply(pose_inverse(at_wrist), at_palm))
     return offsets
 
 
 def _get_points(stage: Stage) -> np.ndarray:
-    """Where the points are. Shape (2, 3).
+    """Return the positions of the target points in the world [m]. Shape (2, 3).
 
     Raises:
         BadValue: If the task has none.
     """
     objects = stage.task.objects
     if not all(f"{side}_point" in objects for side in SIDES):
-        raise BadValue(f"task '{stage.task.name}' has no points for the palms to be at")
+        raise BadValue(f"task '{stage.task.name}' has no target points for the palms")
     return np.array([objects[f"{side}_point"].pose[:3] for side in SIDES])

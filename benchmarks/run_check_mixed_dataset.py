@@ -1,12 +1,11 @@
-"""Run every verb of `xop-curate` on a mixed dataset, and print what each does to its source.
+"""Run every verb of `xop-curate` on a mixed dataset and check that its source stays unchanged.
 
     python -m benchmarks.run_make_mixed_dataset --out outputs/mixed
     python -m benchmarks.run_check_mixed_dataset --root outputs/mixed
 
-Before and after each verb the SHA-256 of every file of the source is taken. A line tells the exit
-code, whether the source is the same byte by byte, and the last line that the verb printed. What the
-verbs make goes to a directory that is deleted. The exit code is 1 if a verb failed or a source
-changed.
+The SHA-256 over all files of the source is taken before and after each verb. A line per verb gives
+its exit code, whether the source is unchanged, and its last line of output. The verbs' results go
+to a temporary directory. The exit code is 1 if a verb failed or a source changed.
 """
 
 from __future__ import annotations
@@ -33,11 +32,11 @@ RUNS: tuple[tuple[str, str], ...] = (
     ("session", "repair --out {out}"),
     ("killed", "repair --out {out}"),
 )
-"""Of which dataset, and the verb with its flags."""
+"""Source dataset, and the verb with its flags."""
 
 
 def compute_digest(root: Path) -> str:
-    """SHA-256 over the names and the contents of all files."""
+    """Compute the SHA-256 over the names and the contents of all files below `root`."""
     whole = hashlib.sha256()
     for path in sorted(root.rglob("*")):
         if path.is_file():
@@ -47,7 +46,7 @@ def compute_digest(root: Path) -> str:
 
 
 def run_verb(words: list[str]) -> tuple[int, str]:
-    """Run a verb; returns its exit code and the last line that it printed."""
+    """Run a verb; returns its exit code and its last line of output."""
     from xop_lerobot.curate.cli import main as curate
 
     output, errors = io.StringIO(), io.StringIO()
@@ -62,18 +61,18 @@ def run_verb(words: list[str]) -> tuple[int, str]:
 
 
 def main() -> int:
-    """Run all, and print a table."""
+    """Run all verbs and print a table; returns the exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--root", type=Path, required=True, help="what make_mixed_dataset.py made")
+    parser.add_argument("--root", type=Path, required=True, help="--out of run_make_mixed_dataset")
     settings = parser.parse_args()
     failed = 0
     with tempfile.TemporaryDirectory(prefix="mixed-") as work:
         for number, (name, line) in enumerate(RUNS):
             root, out = settings.root.resolve() / name, Path(work) / str(number)
             if not root.is_dir():
-                print(f"{name:13}{line.split()[0]:10}not there")
+                print(f"{name:13}{line.split()[0]:10}missing")
                 continue
-            again = Path(work) / "2"  # what filter made
+            again = Path(work) / "2"  # the result of filter, RUNS[2]
             verb, *flags = shlex.split(line.format(out=out, again=again))
             before = compute_digest(root)
             code, text = run_verb([verb, "--root", str(root), *flags, "--quiet"])

@@ -1,10 +1,9 @@
-"""Print how fast and how smoothly a person moves: recorded ones beside the simulated one.
+"""Print the speed and smoothness of recorded people's motion beside the simulated person's.
 
     python -m benchmarks.run_compare_operator recording.npz ... --seeds 4 --plot comparison.png
 
-The recordings are of real people, in the format of docs/how_it_works/operator.md; the simulated
-person touches two points with a robot without physics that follows within 0.3 s. Recordings of
-walking hold no long standing, so sway is compared where the head is slow.
+The recordings are of real people, in the format of docs/how_it_works/operator.md. The simulated
+person walks, turns and reaches at random for 30 s per seed, without a robot.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from xop_lerobot.core.errors import XopError
 
 
 def main() -> None:
-    """Measure, print, and write the plot if asked to."""
+    """Compute and print the table, and write the plot if requested."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("recordings", nargs="+", type=Path, help=".npz recordings of people")
-    parser.add_argument("--seeds", type=int, default=4, help="simulated people")
+    parser.add_argument("--seeds", type=int, default=4, help="number of simulated people")
     parser.add_argument("--plot", type=Path, help="file of the plot, .png or .svg")
     settings = parser.parse_args()
     try:
@@ -43,7 +42,7 @@ def main() -> None:
 
 
 def print_table(motions: list[Motion]) -> None:
-    """One row a person, in Markdown."""
+    """Print a Markdown table, one row per person."""
     rows = [compute_figures(motion) for motion in motions]
     print("| " + " | ".join(["person", *rows[0]]) + " |")
     print("|" + "---|" * (len(rows[0]) + 1))
@@ -52,7 +51,7 @@ def print_table(motions: list[Motion]) -> None:
 
 
 def plot(motions: list[Motion], path: Path) -> None:
-    """Speeds over time, their distributions, and the spectrum of the head."""
+    """Plot speeds over time, their distributions, and the spectrum of the head's velocity."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -65,7 +64,7 @@ def plot(motions: list[Motion], path: Path) -> None:
         for axis, name in ((axes[0, 0], "head"), (axes[0, 1], "left hand")):
             speed = np.sort(motion.speeds[name])
             axis.plot(speed, np.linspace(0, 1, len(speed)), **style)
-            axis.set(xlabel=f"speed of the {name} [m/s]", ylabel="share of the time below")
+            axis.set(xlabel=f"speed of the {name} [m/s]", ylabel="fraction of time below")
         axes[1, 0].plot(motion.time, motion.speeds["head"], **style)
         frequency, power = compute_spectrum(motion)
         axes[1, 1].loglog(frequency, power, **style)

@@ -1,11 +1,11 @@
-"""Print the time and the peak memory of `xop-curate` on synthetic datasets of growing size.
+"""Measure the time and peak memory of `xop-curate` on synthetic datasets of growing size.
 
     python -m benchmarks.run_curate --episodes 10,100,1000 --frames 9000
 
-Episodes of 9,000 frames are six minutes at 25 Hz, so 1,000 of them are 100 hours. They are made by
-`benchmarks.curate_synthetic`, without pictures, and deleted again: 1,000 and what is kept
-of them take about 6 GB of disk in --work. Each command is a process of its own on one thread;
-memory is its maximum resident set.
+An episode of 9,000 frames is six minutes at 25 Hz, so 1,000 of them are 100 hours. They are made by
+`benchmarks.curate_synthetic`, without images, and deleted afterwards: 1,000 and their filtered copy
+take about 6 GB in --work. Each command runs in its own process on one thread; memory is its maximum
+resident set.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ COMMANDS = {
 
 
 def make(root: Path, episodes: int, frames: int, seed: int) -> None:
-    """Make a dataset."""
+    """Write a synthetic dataset."""
     from benchmarks.curate_synthetic import make_dataset
 
     make_dataset(root, episodes, frames, seed=seed)
 
 
 def measure(command: list[str]) -> dict[str, Any]:
-    """Run a command; returns its time [s] and its peak memory [MB]."""
+    """Run an `xop-curate` command; returns its times [s], peak memory [MB] and summary line."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     start = time.perf_counter()
     process = subprocess.Popen(
@@ -63,14 +63,20 @@ def measure(command: list[str]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure each command at each size and print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--episodes", default="10,100,1000", help="numbers of episodes")
-    parser.add_argument("--frames", type=int, default=9000, help="frames of an episode")
+    parser.add_argument(
+        "--episodes", default="10,100,1000", help="numbers of episodes, separated by commas"
+    )
+    parser.add_argument("--frames", type=int, default=9000, help="frames per episode")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--verbs", default="", help="only these, such as report (default: all)")
-    parser.add_argument("--work", type=Path, help="directory for the datasets (default: a new one)")
-    parser.add_argument("--json", type=Path, help="file for the figures (default: none)")
+    parser.add_argument(
+        "--verbs", default="", help="commands to run, separated by commas (default: all)"
+    )
+    parser.add_argument(
+        "--work", type=Path, help="directory for the datasets (default: the system's temporary one)"
+    )
+    parser.add_argument("--json", type=Path, help="file for the results (default: none)")
     settings = parser.parse_args()
     rows = []
     head = ("wall s", "cpu s", "MB")
@@ -78,14 +84,15 @@ def main() -> None:
     for count in map(int, settings.episodes.split(",")):
         work = Path(tempfile.mkdtemp(prefix="curate-", dir=settings.work))
         try:
-            # A child's maximum counts what its parent held when it began: this one stays small.
+            # A child's maximum resident set includes its parent's at the fork, so the parent stays
+            # small: the dataset is made in a process of its own.
             maker = multiprocessing.get_context("spawn").Process(
                 target=make, args=(work / "data", count, settings.frames, settings.seed)
             )
             maker.start()
             maker.join()
             if maker.exitcode:
-                raise SystemExit("the dataset could not be made")
+                raise SystemExit("could not make the dataset")
             size = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
             for name, words in COMMANDS.items():
                 if settings.verbs and name not in settings.verbs.split(","):

@@ -1,14 +1,14 @@
-r"""Print how near a policy's hands come to their points, beside others' in the same episodes.
+r"""Compare policies by the distance of their hands from their target points, episode by episode.
 
     python -m benchmarks.run_evaluate_policy --at 6 --rollouts trained=outputs/rollout_trained \
         untrained=outputs/rollout_untrained
 
-Each of --rollouts is a dataset that `lerobot-rollout` recorded with a robot of this project, in a
-task that has two points (docs/use/training.md). All must be of the same seeds: the first is
-compared with each of the others, with a robot that stands still, and with the best that goes to the
-same places in every episode, found with hindsight. With --margin the exit code is 1 unless it is
-nearer than the others and the one that stands still by so much, at the lower end of the 95%
-interval.
+Each of --rollouts is a dataset that `lerobot-rollout` recorded with a simulated robot of this
+project, in a task with two target points (docs/use/training.md). All must have the same seeds. The
+first is compared with each of the others, with a robot that stands still, and with the best fixed
+places for these episodes, found in hindsight. With --margin the exit code is 1 unless the first is
+nearer than the other rollouts and the standing robot by at least that much, at the lower end of the
+95% interval.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ STILL, BLIND = "stand still", "best without looking"
 
 
 def read_rollouts(texts: list[str], at: float) -> dict[str, Hands]:
-    """Read the hands of `NAME=DIRECTORY`s.
+    """Read the hands of rollouts given as `NAME=DIRECTORY`.
 
     Raises:
-        BadValue: If one is not of that form, or they are not of the same episodes.
+        BadValue: If one is malformed, or the rollouts differ in their settings or episodes.
     """
     from benchmarks.policy_error import read_hands
 
@@ -53,12 +53,12 @@ def read_rollouts(texts: list[str], at: float) -> dict[str, Hands]:
             if mine != its:
                 raise BadValue(f"{first[0]} has {key} {mine} and {name} {its}: not comparable")
         if not np.array_equal(first[1].episodes, hands.episodes):
-            raise BadValue(f"{first[0]} and {name} are not of the same episodes")
+            raise BadValue(f"{first[0]} and {name} do not have the same episodes")
     return found
 
 
 def evaluate(rollouts: dict[str, Hands], at: float) -> dict[str, Any]:
-    """Compute what is printed, fit for JSON."""
+    """Compute errors and margins of all rollouts, as values for JSON."""
     from benchmarks.policy_error import (
         compute_best_blind_error,
         compute_margin,
@@ -98,7 +98,7 @@ def evaluate(rollouts: dict[str, Hands], at: float) -> dict[str, Any]:
 
 
 def print_table(result: dict[str, Any]) -> None:
-    """Print the figures for people."""
+    """Print the result of `evaluate` as text."""
     count, first = result["episodes"], next(iter(result["policies"]))
     print(
         f"{result['task']} with xop_{result['robot']}, seed {result['seed']}, {count} episodes, "
@@ -124,12 +124,12 @@ def print_table(result: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Evaluate, print, and write JSON."""
+    """Evaluate the rollouts, print the result, and write it as JSON if requested."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rollouts", nargs="+", required=True, metavar="NAME=DIRECTORY")
-    parser.add_argument("--at", type=float, default=6.0, help="judged so late in an episode [s]")
-    parser.add_argument("--margin", type=float, help="asked for, over each other one [m]")
-    parser.add_argument("--json", type=Path, help="file for the figures (default: none)")
+    parser.add_argument("--at", type=float, default=6.0, help="evaluated time of an episode [s]")
+    parser.add_argument("--margin", type=float, help="required margin over each other rollout [m]")
+    parser.add_argument("--json", type=Path, help="file for the results (default: none)")
     settings = parser.parse_args()
     try:
         result = evaluate(read_rollouts(settings.rollouts, settings.at), settings.at)
@@ -141,7 +141,7 @@ def main() -> None:
     if settings.margin is not None:
         rivals = {key: margin for key, margin in result["margins"].items() if key != BLIND}
         least = min(margin["interval"][0] for margin in rivals.values())
-        print(f"least margin {least:.3f} m, asked for {settings.margin:.3f} m")
+        print(f"smallest margin {least:.3f} m, required {settings.margin:.3f} m")
         sys.exit(0 if least >= settings.margin else 1)
 
 

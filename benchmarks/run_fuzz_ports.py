@@ -1,9 +1,9 @@
-"""Send garbage to every port that is open, and print what it has done.
+"""Send garbage to every port that the project opens, and report the effects.
 
     python -m benchmarks.run_fuzz_ports --bytes 10000000
 
-Everything stays on this machine. The process that is attacked is one of its own, so that a crash
-and the growth of its memory show; an operator, or a client, that behaves well goes on beside.
+Everything stays on this machine. Each server under test runs in its own process, so that a crash or
+growing memory shows, while a well-behaved operator or client keeps using it.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ PORTS = ("webxr", "webxr-tls", "control", "avp")
 
 
 def main() -> int:
-    """Run and print; return 1 if something was disturbed."""
+    """Fuzz the ports and print a table; returns 1 if a fault was found."""
     import fuzzing
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--bytes", type=int, default=10_000_000, help="bytes for each port")
+    parser.add_argument("--bytes", type=int, default=10_000_000, help="bytes sent to each port")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--ports", nargs="+", choices=PORTS, default=PORTS)
     settings = parser.parse_args()

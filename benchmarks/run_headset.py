@@ -1,12 +1,12 @@
-"""Measure how old a headset's frame is when it is read, and when its command is there.
+"""Measure a headset's delays: from sending a frame to its arrival and to the resulting command.
 
     python -m benchmarks.run_headset --seconds 30
     python -m benchmarks.run_headset --sender browser --retargeter mpc
 
-A sender in a process of its own sends frames over loopback, with the stamps of the clock that all
-processes of a machine share, engages by the gesture and drives a simulated robot in real time. It
-is a program that behaves like the page, or the page itself in headless Chromium, with an emulated
-headset. To the command, the wait for the next tick of the control loop is part of the delay: half a
+A sender in its own process sends frames over loopback, stamped by the machine's shared monotonic
+clock, engages by the gesture and drives a simulated robot in real time. The sender is either a
+program that behaves like the page, or the page itself in headless Chromium with an emulated
+headset. The delay to the command includes the wait for the next tick of the control loop, half a
 period on average.
 """
 
@@ -31,12 +31,13 @@ from xop_lerobot.morphology.morphology import list_robots
 CODE = "BENCHMARK"
 SPAWN = multiprocessing.get_context("spawn")
 OPEN_S, GESTURE_S = 1.2, 2.0
-"""Hands are open at first, then the gesture is held."""
+"""Times for which the hands are open at first, and for which the gesture is held [s]."""
 LEVEL, TURNED = [0.0, 0, 0, 1], [0.0, 0, 1, 0]
+"""Orientations xyzw of the wrists: level, and turned for the gesture that engages."""
 
 
 def make_message(number: int, t: float) -> dict[str, Any]:
-    """Somebody who sways, and holds the gesture from 1.2 to 3.2 s."""
+    """Make the page's message `number` at `t` [s]: a swaying person who engages at 1.2 to 3.2 s."""
     gesture = OPEN_S <= t < OPEN_S + GESTURE_S
     sway = [0.004 * math.sin(3 * t), 0.004 * math.cos(2 * t), 0.004 * math.sin(5 * t)]
 
@@ -46,7 +47,7 @@ def make_message(number: int, t: float) -> dict[str, Any]:
     def make_hand(x: float) -> dict[str, Any]:
         thumb, pinch = [x, 1.15, -0.4], 0.008 if gesture else 0.07
         wrist = [*add([x, 1.15, -0.3]), *(TURNED if gesture else LEVEL)]
-        joints = [0.12345] * 75  # as long as a page's
+        joints = [0.12345] * 75  # as many as the page sends, for messages of the same length
         return {"wrist": wrist, "thumb": thumb, "index": [x, 1.15 + pinch, -0.4], "joints": joints}
 
     head = [*add([0, 1.6, 0]), *LEVEL]
@@ -55,7 +56,13 @@ def make_message(number: int, t: float) -> dict[str, Any]:
 
 
 def send_frames(port: int, seconds: float, rate: float) -> None:
-    """Be a page."""
+    """Send frames as the page does, and answer its pings.
+
+    Args:
+        port: Port of the WebXR device.
+        seconds: Duration [s].
+        rate: Frames per second [Hz].
+    """
     from websockets.sync.client import connect
 
     with connect(f"ws://localhost:{port}/ws?code={CODE}&role=operator", proxy=None) as ws:
@@ -75,7 +82,14 @@ def send_frames(port: int, seconds: float, rate: float) -> None:
 
 
 def send_from_browser(port: int, seconds: float, rate: float, origin: Any) -> None:
-    """Be a headset in Chromium, which has its own rate; `origin` is when its clock began [s]."""
+    """Drive the page in Chromium with an emulated headset.
+
+    Args:
+        port: Port of the WebXR device.
+        seconds: Duration after the gesture [s].
+        rate: Ignored; the browser has its own rate.
+        origin: Receives the monotonic time at which the browser's clock was zero [s].
+    """
     del rate
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "helpers"))
     import headset
@@ -85,7 +99,7 @@ def send_from_browser(port: int, seconds: float, rate: float, origin: Any) -> No
         page = browser.new_page(viewport={"width": 480, "height": 320})
         headset.install(page)
         page.goto(f"http://localhost:{port}/?code={CODE}")
-        # Chromium's clock is the machine's, from an origin that it tells by the time of day.
+        # Chromium counts from an origin that it gives as time of day; convert it to monotonic time.
         time_of_day = time.time() - time.monotonic()
         origin.value = page.evaluate("performance.timeOrigin") / 1e3 - time_of_day
         page.evaluate("wearer.embody()")
@@ -105,26 +119,26 @@ def send_from_browser(port: int, seconds: float, rate: float, origin: Any) -> No
 
 
 class Delays:
-    """What is measured: all in seconds."""
+    """Measured delays and processor times [s]."""
 
     def __init__(self) -> None:
         self.sent: dict[float, float] = {}
-        """When each frame was sent, by its time."""
+        """Monotonic time at which each frame was sent, by the frame's own time."""
         self.frame: list[float] = []
         self.command: list[float] = []
         self.told: list[float] = []
         self.parse_work: list[float] = []
-        """Time of the processor alone, which does not depend on what else the machine does."""
+        """Processor time of the thread, which other load on the machine does not change."""
         self.judge_work: list[float] = []
         self.tick_work: list[float] = []
         self.late_ticks = 0
 
     def print(self) -> None:
-        """Print a row for each."""
+        """Print a row of percentiles for each quantity."""
         for what, delays in (
             ("send -> OperatorFrame", self.frame),
             ("send -> command", self.command),
-            ("as the device tells it", self.told),
+            ("reported by the device", self.told),
             ("processor: parse", self.parse_work),
             ("processor: judge, smooth", self.judge_work),
             ("processor: frame -> command", self.tick_work),
@@ -140,7 +154,7 @@ class Delays:
 
 
 def measure_parsing(delays: Delays) -> None:
-    """Parse a thousand messages."""
+    """Time the parsing of 1,000 messages."""
     from xop_lerobot.operator.webxr.protocol import parse_message
 
     for number in range(1000):
@@ -154,8 +168,8 @@ def add_device(delays: Delays, origin: Any) -> None:
     """Register the device `measured`: a WebXR page whose frames are timed.
 
     Args:
-        delays: Where they are noted.
-        origin: When the sender's clock began, on this machine's [s].
+        delays: Receives the times.
+        origin: Monotonic time at which the sender's clock was zero [s].
     """
     from xop_lerobot.operator.devices import DEVICES
     from xop_lerobot.operator.devices.webxr import WebXrDevice
@@ -176,7 +190,7 @@ def add_device(delays: Delays, origin: Any) -> None:
 
 
 def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
-    """Let the sender drive the robot in real time until it is gone."""
+    """Let the sender drive the robot in real time until the sender ends."""
     from xop_lerobot.evaluation.trial import closed_loop
     from xop_lerobot.morphology.morphology import make_morphology
     from xop_lerobot.operator.devices import DeviceConfig
@@ -215,6 +229,7 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
                 delays.command.append(now - delays.sent[tick.frame.time])
                 delays.told.append(device.status.delay or 0.0)
             loop.execute(action, 1 / fps)
+            # After a stall of more than 1 s the schedule restarts instead of catching up.
             due = max(due + 1 / fps, time.monotonic() - 1)
             wait = due - time.monotonic()
             delays.late_ticks += wait < 0
@@ -223,13 +238,13 @@ def drive(settings: argparse.Namespace, delays: Delays, origin: Any) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Run the benchmark and print its delays."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--robot", choices=list_robots(), default="g1")
     parser.add_argument("--retargeter", choices=["direct", "mpc"], default="direct")
     parser.add_argument("--fps", type=int, default=25, help="rate of the control loop [Hz]")
     parser.add_argument("--sender", choices=["program", "browser"], default="program")
-    parser.add_argument("--rate", type=float, default=72.0, help="frames of the program [Hz]")
+    parser.add_argument("--rate", type=float, default=72.0, help="frame rate of the program [Hz]")
     parser.add_argument("--seconds", type=float, default=20.0)
     settings = parser.parse_args()
     delays, origin = Delays(), SPAWN.Value("d", 0.0)

@@ -1,14 +1,14 @@
-"""Make a small dataset of mixed episodes and a killed session, to try `xop-curate` on.
+"""Record a small dataset of mixed episodes and a killed session, to test `xop-curate` on.
 
     .venv/bin/python -m benchmarks.run_make_mixed_dataset --out outputs/mixed
 
-A G1 in simulation follows a made-up person who crouches and stands up again: some do it well, some
-not deeply enough, some robots are pushed over, some headsets lose track, some people stand about
-before or after. No planner runs (`--teleop.retargeter.type=direct`) and the pictures are tiny, so
+A simulated G1 follows a synthetic person who crouches and stands up again. Some crouch well, some
+not deeply enough; some robots are pushed over, some headsets lose tracking, some people stand idle
+before or after. No planner runs (`--teleop.retargeter.type=direct`) and the images are tiny, so
 that 30 episodes take about a minute. The same seed makes the same episodes.
 
     OUT/session        the episodes, as `xop-record` writes them
-    OUT/kinds.json     what each of them is: success, failure, fall, tracking_loss, idle_start, …
+    OUT/kinds.json     the kind of each: success, failure, fall, tracking_loss, idle_start, …
     OUT/killed         a session of `xop-record`, killed (`kill -9`) in the middle of an episode
 """
 
@@ -50,16 +50,16 @@ HANDS = {
     "left": ((0.173, 0.234, -0.555), (0.737, -0.667, 0.074, 0.080)),
     "right": ((0.173, -0.234, -0.555), (0.737, 0.667, 0.074, -0.080)),
 }
-"""Wrists from the head [m], and wxyz: as a G1 holds them at rest, so that its arms need not move
-when the person engages."""
+"""Positions of the wrists from the head [m] and orientations wxyz: those of a G1 at rest, so that
+its arms need not move when the person engages."""
 KILLED_EPISODES = 3
-"""Episodes that a killed session had saved."""
+"""Episodes that the killed session saves first."""
 SESSION = "mixed"
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
-    # A process that is killed cleans nothing up, and is meant not to.
+    # The killed process leaves resources behind on purpose.
     "PYTHONWARNINGS": "ignore:resource_tracker,ignore:Cannot enable progress bars",
 }
 
@@ -69,12 +69,13 @@ class Kind:
     """One kind of episode.
 
     Attributes:
-        depth: How far the person crouches [m].
-        idle_start: How long the person stands still before [s].
-        idle_end: How long the person stands still after [s].
-        lost: Limbs (head, left wrist, right wrist) that the headset loses on the way down.
-        lost_s: For how long [s].
-        push: Force that throws the robot over [N].
+        depth: Depth of the crouch [m].
+        idle_start: Time for which the person stands still before [s].
+        idle_end: Time for which the person stands still after [s].
+        lost: Indices of the frames (head, left wrist, right wrist) that the headset loses on the
+            way down.
+        lost_s: Duration of the loss [s].
+        push: Force that pushes the robot over [N].
     """
 
     depth: float = 0.28
@@ -97,7 +98,7 @@ ORDER = (
     "success", "failure", "success", "idle_start", "success", "fall", "success", "tracking_loss",
     "success", "idle_both",
 )  # fmt: skip
-"""Kinds of ten episodes on end; after them it begins again."""
+"""Kinds of ten consecutive episodes; repeated from then on."""
 
 
 @TASKS.register("crouch")
@@ -108,7 +109,7 @@ class Crouch(Task):
     instruction = "crouch and stand up again"
     time_limit = 20.0
     push: ClassVar[float] = 0.0
-    """Force on the trunk from 1.0 s to 1.3 s after the start [N]; a switch of this script's."""
+    """Force on the trunk from 1.0 s to 1.3 s after the start [N]; set per episode by `Recorder`."""
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add nothing."""
@@ -119,7 +120,7 @@ class Crouch(Task):
         self._trunk = plant.model.body(self.morphology.base_body).id
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Start over."""
+        """Measure the head's height and forget the last crouch."""
         del rng
         self._start, self._begin = self._height, self._plant.time
         self._was_low = self._success = False
@@ -129,7 +130,7 @@ class Crouch(Task):
         return float(self._plant.get_site_pose(self.morphology.frames["head"])[2])
 
     def update(self) -> TaskStatus:
-        """See how deep the head is, and push the robot where that is asked for."""
+        """Track the head's depth, and push the robot during its push."""
         lowered = self._start - self._height
         self._was_low |= lowered > 0.12
         self._success |= self._was_low and lowered < 0.05 and not self._plant.has_fallen
@@ -139,12 +140,16 @@ class Crouch(Task):
 
     @property
     def objects(self) -> Mapping[str, SeenObject]:
-        """Nothing to see."""
+        """No objects."""
         return {}
 
 
 def make_motion(kind: Kind, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Make an operator recording of one kind: stand, crouch, stand up, stand.
+
+    Args:
+        kind: Kind of the episode.
+        rng: Random generator of speed, depth and sway.
 
     Returns:
         The arrays of an operator recording (docs/how_it_works/operator.md), at 50 Hz.
@@ -156,7 +161,7 @@ def make_motion(kind: Kind, rng: np.random.Generator) -> dict[str, np.ndarray]:
     lowered = depth * (_rise(t, marks[0], down) - _rise(t, marks[2], up))
 
     def sway(size: float) -> np.ndarray:
-        """Postural sway of a standing person, as published (docs/how_it_works/operator.md)."""
+        """Return postural sway of amplitude `size` [m], as in docs/how_it_works/operator.md."""
         rates, phases = rng.uniform(0.1, 0.6, 3), rng.uniform(0, 2 * np.pi, 3)
         return size * np.sin(2 * np.pi * rates * t[:, None] + phases)
 
@@ -177,18 +182,18 @@ def make_motion(kind: Kind, rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 def _rise(t: np.ndarray, start: float, duration: float) -> np.ndarray:
-    """Movement of minimum jerk from 0 to 1. Shape (T,)."""
+    """Return a minimum-jerk movement from 0 to 1. Shape (T,)."""
     s = np.clip((t - start) / duration, 0, 1)
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 class Recorder:
-    """Records single episodes of given kinds into one dataset.
+    """Record single episodes of given kinds into one dataset.
 
     Args:
         root: Directory of the dataset, which must not exist.
-        seed: Seed of all that is random.
-        size: Width and height of a picture [pixel].
+        seed: Seed of the robot and of the person's motions.
+        size: Width and height of an image [pixel].
     """
 
     def __init__(self, root: Path, seed: int, size: tuple[int, int]) -> None:
@@ -235,7 +240,7 @@ class Recorder:
         return teleop
 
     def record(self, index: int, name: str, ticks: int | None = None) -> None:
-        """Record episode `index` of the kind `name`, or its first `ticks` without saving it."""
+        """Record episode `index` of the kind `name`, or only its first `ticks`, unsaved."""
         from xop_lerobot.recording.tick import run_tick
 
         rng = np.random.default_rng([self._seed, index])
@@ -258,7 +263,7 @@ class Recorder:
             self.dataset.save_episode()
 
     def close(self) -> None:
-        """Close the files and let go of the robot."""
+        """Finalize the dataset and disconnect the robot."""
         self.dataset.finalize()
         self.robot.disconnect()
 
@@ -277,7 +282,7 @@ def make_session(root: Path, seed: int, size: tuple[int, int], kinds: Sequence[s
 
 
 def make_killed(root: Path, seed: int, size: tuple[int, int]) -> None:
-    """Record a session and kill this process in the middle of its last episode."""
+    """Record a session and kill this process in the middle of its last, unsaved episode."""
     recorder = Recorder(root, seed, size)
     for index in range(KILLED_EPISODES):
         recorder.record(index, ORDER[index])
@@ -286,16 +291,16 @@ def make_killed(root: Path, seed: int, size: tuple[int, int]) -> None:
 
 
 def main() -> int:
-    """Make it all; returns the exit code."""
+    """Record all sessions; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, required=True, help="directory for all of it")
-    parser.add_argument("--episodes", type=int, default=30, help="episodes of the whole session")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all that is random")
-    parser.add_argument("--width", type=int, default=48, help="of a picture [pixel]")
-    parser.add_argument("--height", type=int, default=36, help="of a picture [pixel]")
-    parser.add_argument("--only-session", action="store_true", help="leave the killed one out")
+    parser.add_argument("--out", type=Path, required=True, help="directory for the results")
+    parser.add_argument("--episodes", type=int, default=30, help="episodes of OUT/session")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
+    parser.add_argument("--width", type=int, default=48, help="width of an image [pixel]")
+    parser.add_argument("--height", type=int, default=36, help="height of an image [pixel]")
+    parser.add_argument("--only-session", action="store_true", help="do not make OUT/killed")
     args = parser.parse_args()
     try:
         make_all(args)
@@ -305,11 +310,11 @@ def main() -> int:
 
 
 def make_all(args: argparse.Namespace) -> None:
-    """Make the whole session, then another one that is killed.
+    """Record the complete session, then the one that is killed.
 
     Raises:
-        BadValue: If there are too few episodes, or the directory holds something.
-        XopError: If a session ends in another way than it should.
+        BadValue: If there are too few episodes, or the directory is not empty.
+        XopError: If a session does not end as expected.
     """
     least = KILLED_EPISODES + 1
     if args.episodes < least:
@@ -326,10 +331,10 @@ def make_all(args: argparse.Namespace) -> None:
 
 
 def run(target: Callable[..., None], *arguments: Any, expected: int = 0) -> None:
-    """Run `target` in a process of its own, which has imported what is slow to import.
+    """Run `target` in its own process, forked from one that has done the slow imports.
 
     Raises:
-        XopError: If it does not end with the exit code `expected`.
+        XopError: If the process does not end with the exit code `expected`.
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
@@ -343,7 +348,7 @@ def run(target: Callable[..., None], *arguments: Any, expected: int = 0) -> None
 
 
 def _run_calmly(target: Callable[..., None], *arguments: Any) -> None:
-    """Run `target` without what encoders and decoders tell of themselves."""
+    """Run `target` without the log messages of the video codecs."""
     import av.logging
 
     av.logging.set_libav_level(av.logging.ERROR)

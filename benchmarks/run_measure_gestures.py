@@ -1,11 +1,11 @@
-"""Count the gestures that nobody made: in recordings, and in hours of simulated work.
+"""Count falsely recognised gestures, in recordings and in hours of simulated work.
 
     python -m benchmarks.run_measure_gestures recording.npz outputs/dataset --hours 1 --seed 0
 
-Motion comes from recordings (`.npz`, or the episodes of a dataset), again and again, and from a
-simulated person who stands, walks, turns and reaches. Hands close and open by chance, for 0.1 to
-15 s, as in work. `turned` also gives each hand a new orientation with every grasp, any of them as
-likely as any other, which nobody does: it shows what the orientation alone keeps apart.
+Motion comes from recordings (`.npz`, or the episodes of a dataset), played repeatedly, and from a
+simulated person who stands, walks, turns and reaches. Hands close and open at random, for 0.1 to
+15 s, as in work. `turned` also gives each hand a new orientation with every grasp, uniform over all
+rotations; real hands are not, so it shows how well the hand's orientation alone prevents gestures.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from xop_lerobot.operator.recording import Recording, load_recording
 RATE = 50
 """Rate of the streams [Hz]."""
 SHUT, OPEN = 0.008, 0.07
-"""Distance of thumb and index tip of a closed and an open hand [m]."""
+"""Distance between thumb and index tip of a closed and an open hand [m]."""
 NAMES = ("engage", "mode", "upright", "success", "end", "redo", "stop")
 
 
 def play(recordings: list[Recording], length: float) -> Iterator[OperatorFrame]:
-    """Play recordings one after another until `length` [s] is over."""
+    """Yield the frames of recordings one after another, repeatedly, for at least `length` [s]."""
     start = 0.0
     while start < length:
         for recording in recordings:
@@ -48,7 +48,13 @@ def play(recordings: list[Recording], length: float) -> Iterator[OperatorFrame]:
 def work(
     frames: Iterator[OperatorFrame], rng: np.random.Generator, *, turned: bool
 ) -> Iterator[OperatorFrame]:
-    """Let hands close and open by chance; `turned` gives each grasp a hand of any orientation."""
+    """Let the hands close and open at random.
+
+    Args:
+        frames: Frames whose pinch is replaced.
+        rng: Random generator.
+        turned: Whether each hand also gets a random orientation with every grasp.
+    """
     closed, until = np.zeros(2, dtype=bool), np.zeros(2)
     quats: list[np.ndarray | None] = [None, None]
     for frame in frames:
@@ -69,14 +75,14 @@ def work(
 
 
 def count(frames: Iterator[OperatorFrame]) -> tuple[float, int, Counter[str]]:
-    """Count gestures: hours of the stream, how often hands closed, and gestures by name."""
+    """Count gestures; returns the stream's length [h], its pinches, and gestures by name."""
     hands, clutch = Hands(GestureConfig(), has_person=True), Clutch()
     counts: Counter[str] = Counter()
     first = last = None
     pinches, closed, engaged = 0, np.zeros(2, dtype=bool), False
     for frame in frames:
         first, last = frame.time if first is None else first, frame.time
-        now = frame.pinch < 0.018
+        now = frame.pinch < 0.018  # between SHUT and OPEN
         pinches += int((now & ~closed).sum())
         closed = now
         asked = hands.read(frame)
@@ -101,11 +107,13 @@ def load(path: Path) -> list[Recording]:
 
 
 def main() -> None:
-    """Count, and print one line for each kind of motion."""
+    """Count gestures and print a line for each kind of motion."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("recordings", nargs="*", type=Path, help=".npz recordings, datasets")
-    parser.add_argument("--hours", type=float, default=0.1, help="of each kind of motion [h]")
-    parser.add_argument("--seed", type=int, default=0, help="of the chance (default 0)")
+    parser.add_argument(
+        "--hours", type=float, default=0.1, help="length of each kind of motion [h]"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="random seed (default: 0)")
     settings = parser.parse_args()
     length = 3600 * settings.hours
     try:

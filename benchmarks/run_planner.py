@@ -1,4 +1,4 @@
-"""Print the planner's own time per solve beside that of pytorch_mppi's KMPPI.
+"""Compare the planner's time per solve with that of pytorch_mppi's KMPPI.
 
     python -m benchmarks.run_planner --repeats 500
 
@@ -14,7 +14,7 @@ from xop_lerobot.core.command_line import make_output_readable
 
 
 def main() -> None:
-    """Measure and print."""
+    """Time both planners and print a Markdown table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--repeats", type=int, default=300, help="solves per planner and row")
     parser.add_argument("--seed", type=int, default=0)

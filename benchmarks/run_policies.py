@@ -1,14 +1,14 @@
-"""Compare G1's low-level policies, alone and under the model predictive controller.
+"""Compare G1's low-level policies, alone and under the model-predictive retargeter.
 
     python -m benchmarks.run_policies --policies default falcon openwbt=FOLDER
     python -m benchmarks.run_policies --policies all=FOLDER \
         --docs docs/results/low_level_policies.md --json outputs/policies.json
 
-A policy is a name, the path of a table of your own, or either with its file or folder behind `=`.
-Parts: `speed` of one call; plain `commands` held for 10 s; `arms` held anywhere; random
+A policy is a name or the path of a policy table, optionally followed by `=` and its file or folder.
+Parts: `speed` of one call; plain `commands` held for 10 s; `arms` held in postures; random
 `sequences`; `mpc`, the scenarios of benchmarks/run_tracking.py with the policy in the planner's
-rollouts. What a JSON file holds already is not run again. `--parts rest` prints how each policy's
-standing robot leans and moves its base unasked, as its table holds it.
+rollouts. Results that the JSON file already contains are not run again. `--parts rest` prints each
+policy's uncommanded pitch and forward shift at rest, in the format of its table.
 """
 
 from __future__ import annotations
@@ -54,37 +54,37 @@ from xop_lerobot.morphology.morphology import make_morphology
 
 PARTS = ("speed", "commands", "arms", "sequences", "mpc")
 REST = "rest"
-"""A part that measures for a policy's table, and is not compared."""
+"""The part that measures values for a policy's table instead of comparing policies."""
 HEIGHTS = (0.75, 0.55, 0.45)
-"""Heights of the pelvis at which arms are held [m]."""
+"""Pelvis heights at which arm postures are held [m]."""
 SCENARIOS = ("squat", "yaw", "pitch", "diagonal", "sideways", "quarter", "curve", "arms")
-"""Scenarios under the controller."""
+"""Scenarios of the part `mpc`."""
 
 type Results = dict[str, dict[str, Any]]
-"""Figures by policy and part."""
+"""Metrics by policy and part."""
 
 
 def parse_arguments() -> argparse.Namespace:
-    """Read the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
     add("--policies", nargs="+", default=["default"], help="NAME, NAME=PATH, or all=FOLDER")
-    add("--parts", default=",".join(PARTS), help="with commas between (default: all)")
-    add("--trials", type=int, default=100, help="sequences, postures (default: 100)")
-    add("--seconds", type=float, default=20.0, help="length of a sequence [s] (default: 20)")
-    add("--seeds", type=int, default=3, help="seeds under the controller (default: 3)")
-    add("--scenarios", default=",".join(SCENARIOS), help="under the controller")
-    add("--seed", type=int, default=0, help="the first seed (default: 0)")
+    add("--parts", default=",".join(PARTS), help="parts, separated by commas (default: all)")
+    add("--trials", type=int, default=100, help="random sequences and postures (default: 100)")
+    add("--seconds", type=float, default=20.0, help="duration of a sequence [s] (default: 20)")
+    add("--seeds", type=int, default=3, help="number of seeds of `mpc` (default: 3)")
+    add("--scenarios", default=",".join(SCENARIOS), help="scenarios of `mpc`, separated by commas")
+    add("--seed", type=int, default=0, help="first seed (default: 0)")
     add("--threads", type=int, default=2, help="threads of the simulation (default: 2)")
-    add("--json", type=Path, help="figures, added to what the file holds")
-    add("--docs", type=Path, help="Markdown page whose table is to be replaced")
+    add("--json", type=Path, help="file of the results, which is extended")
+    add("--docs", type=Path, help="Markdown page whose table is replaced")
     return parser.parse_args()
 
 
 def find_policies(words: Iterable[str]) -> dict[str, str | None]:
-    """Names of policies and their paths; of ``all`` those whose files are there."""
+    """Return policies' names and paths; for ``all`` those whose files exist."""
     found: dict[str, str | None] = {}
     for word in words:
         name, _, path = word.partition("=")
@@ -105,7 +105,7 @@ def find_policies(words: Iterable[str]) -> dict[str, str | None]:
 def run_part(
     part: str, name: str, path: str | None, policy: LowLevelPolicy, arguments: argparse.Namespace
 ) -> Any:
-    """Run one part with one policy."""
+    """Run one part with one policy; returns its metrics."""
     trials, seed, threads = arguments.trials, arguments.seed, arguments.threads
     if part == "commands":
         return measure_responses(policy, threads)
@@ -137,7 +137,7 @@ def run_part(
 
 
 def measure_arms(policy: LowLevelPolicy, trials: int, seed: int, threads: int) -> dict[str, Any]:
-    """Hold arms in the postures that people take, and in random ones over 90 % of the ranges."""
+    """Hold the arms in the postures of `ARMS`, and in random ones over 90 % of the ranges."""
     named = hold_arms(policy, make_named_arms(), Mode.STATIONARY, threads=threads)
     figures: dict[str, Any] = {
         name: None if fell else float(travel)
@@ -162,7 +162,11 @@ def measure_arms(policy: LowLevelPolicy, trials: int, seed: int, threads: int) -
 
 
 def run_all(policies: Mapping[str, str | None], arguments: argparse.Namespace) -> Results:
-    """Run what is missing in the file of results, and return all of it."""
+    """Run the parts missing in the results file, and return all results.
+
+    Raises:
+        UnknownName: If there is no such part.
+    """
     file: Path | None = arguments.json
     kept = json.loads(file.read_text()) if file is not None and file.is_file() else {}
     results: Results = {name: kept.get(name, {}) for name in policies}
@@ -171,7 +175,7 @@ def run_all(policies: Mapping[str, str | None], arguments: argparse.Namespace) -
         if part not in PARTS:
             raise UnknownName("part", part, PARTS)
         missing = [name for name in policies if part not in results[name]]
-        if part == "speed" and missing:  # side by side, so all anew
+        if part == "speed" and missing:  # policies are timed alternately, so all of them again
             for name, speeds in measure_speeds(made).items():
                 results[name][part] = speeds
             missing = []
@@ -184,14 +188,14 @@ def run_all(policies: Mapping[str, str | None], arguments: argparse.Namespace) -
 
 
 def save(file: Path | None, results: Results) -> None:
-    """Write all figures, where a file is named."""
+    """Write the results to `file`, if given."""
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(results, indent=1) + "\n")
 
 
 def write_table(results: Results, arguments: argparse.Namespace) -> str:
-    """Write the figures as Markdown tables, a column a policy."""
+    """Format the results as Markdown tables, one column per policy."""
     lines = [
         f"Planning model, MuJoCo {mujoco.__version__}; {arguments.trials} random sequences of "
         f"{arguments.seconds:g} s and {arguments.trials} postures a row, seed {arguments.seed}. "
@@ -223,7 +227,7 @@ def write_table(results: Results, arguments: argparse.Namespace) -> str:
 
 
 def write_rest(rest: MeasuredRest) -> str:
-    """Write a measured rest as the table of a policy holds it."""
+    """Format a measured rest as the section `[rest]` of a policy's table."""
 
     def write(rows: np.ndarray) -> str:
         return "".join(f"    [{', '.join(f'{value:.3f}' for value in row)}],\n" for row in rows)
@@ -282,9 +286,9 @@ def _write_mpc(figures: Mapping[str, list[Mapping[str, Any]]]) -> dict[str, str]
         )
         values = [run["metrics"][key] for run in runs if run["metrics"][key] is not None]
         falls = sum(bool(run["metrics"]["falls"]) for run in runs)
-        told = f" ({falls})" if falls else ""
-        figures_told = f"{np.median(values):.1f} / {max(values):.1f}" if values else "lost"
-        cells[scenario] = figures_told + told
+        fallen = f" ({falls})" if falls else ""
+        spread = f"{np.median(values):.1f} / {max(values):.1f}" if values else "lost"
+        cells[scenario] = spread + fallen
     return cells
 
 

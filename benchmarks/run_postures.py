@@ -1,9 +1,9 @@
-"""Drive robots to random reachable goals of the head in simulation, and tell which they miss.
+"""Drive a simulated robot to random reachable goals of the head, and report those it misses.
 
     python -m benchmarks.run_postures --robot rby1 --goals 20
     python -m benchmarks.run_postures --robot g1 --goals 10 --noise mild
 
-Goals are made from postures that the robot can hold, so each can be reached; the robot goes from
+Goals are head poses of postures that the robot can hold, so each is reachable; the robot goes from
 each to the next in stationary mode. The tests do the same with the kinematic proposal alone.
 """
 
@@ -38,16 +38,17 @@ from xop_lerobot.session import Tick
 from xop_lerobot.teleoperation import TeleoperationConfig
 
 NEAR_M, NEAR_DEG = 0.05, 5.0
+"""Errors up to which a goal counts as reached [m], [deg]."""
 LOWEST, MOST_TILTED = 0.5, 100.0
-"""Goals lower [m] or more tilted [deg] are nobody's head's."""
+"""Minimum height [m] and maximum tilt [deg] of a goal: no person's head goes beyond."""
 
 
 class Head(Device):
-    """A head that is where it is put; its hands go with it.
+    """An operator whose head has the pose `head`; the hands follow its position and heading.
 
     Args:
-        head: Where it is at first. Shape (7,).
-        wrists: Where the wrists are then. Shapes (7,).
+        head: Initial pose of the head. Shape (7,).
+        wrists: Initial poses of the wrists by name. Shapes (7,).
     """
 
     self_engaging = True
@@ -59,10 +60,10 @@ class Head(Device):
         self._from_head = {name: pose_multiply(level, pose) for name, pose in wrists.items()}
 
     def start(self, time: float) -> None:
-        """Nothing begins."""
+        """Do nothing: the pose does not depend on time."""
 
     def read(self, time: float) -> OperatorFrame:
-        """The head where it is, and the hands as they hang on it."""
+        """Return the head and the hands that follow it."""
         wrists = {
             name: pose_multiply(level_pose(self.head), p) for name, p in self._from_head.items()
         }
@@ -72,7 +73,7 @@ class Head(Device):
 
 
 def draw_goals(retargeter: MpcRetargeter, count: int, seed: int) -> np.ndarray:
-    """Draw poses of the head in postures that the robot can hold. Shape (count, 7)."""
+    """Draw head poses from the robot's repertoire of postures. Shape (count, 7)."""
     morphology, model = retargeter.morphology, retargeter.rollout.model
     repertoire = Repertoire(
         model,
@@ -90,13 +91,13 @@ def draw_goals(retargeter: MpcRetargeter, count: int, seed: int) -> np.ndarray:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the check; 1 if a goal is missed or the robot falls."""
+    """Run the check; returns 1 if a goal is missed or the robot falls."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--robot", default="rby1", help=f"{say_robots()} (default: rby1)")
     parser.add_argument("--goals", type=int, default=20, help="number of goals (default: 20)")
-    parser.add_argument("--hold", type=float, default=6.0, help="time for each [s] (default: 6)")
+    parser.add_argument("--hold", type=float, default=6.0, help="time per goal [s] (default: 6)")
     parser.add_argument("--noise", default="off", help="sensor noise (default: off)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the goals (default: 0)")
     args = parser.parse_args(arguments)
@@ -126,12 +127,13 @@ def main(arguments: list[str] | None = None) -> int:
                 action, _ = teleoperation.step(Tick(loop.state))
                 loop.execute(action, teleoperation.dt)
             reached = measure()["head"]
-            away = float(np.linalg.norm(reached[:3] - goal[:3]))
-            turned = float(np.degrees(np.linalg.norm(rotation_error(goal[3:], reached[3:]))))
-            failed = away > NEAR_M or turned > NEAR_DEG
+            offset = float(np.linalg.norm(reached[:3] - goal[:3]))
+            angle = float(np.degrees(np.linalg.norm(rotation_error(goal[3:], reached[3:]))))
+            failed = offset > NEAR_M or angle > NEAR_DEG
             missed += failed
             verdict = "missed" if failed else "reached"
-            print(f"goal {i}: {verdict}, {away * 100:.1f} cm and {turned:.1f} deg away", flush=True)
+            error = f"{offset * 100:.1f} cm and {angle:.1f} deg"
+            print(f"goal {i}: {verdict}, {error} away", flush=True)
             if loop.state.fallen:
                 print("the robot has fallen")
                 break

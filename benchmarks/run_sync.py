@@ -1,12 +1,12 @@
-"""How much better does the planner predict from a synchronised state than from a raw measurement?
-
-A robot stands, walks or drives in the simulated plant under noisy sensors. At every tick each way
-of synchronising gets the same measurement. At every tenth tick the planner's prediction (planning
-model, low-level policy with the plant's memory) is started from the state each gives, and from
-the true one; printed is by how much the predicted displacements of the base differ after 60 and
-200 ms, and how far the states themselves are from the truth.
+"""Compare the planner's predictions from synchronised states with those from raw measurements.
 
     python -m benchmarks.run_sync --seeds 5 --duration 12 --noise mild
+
+A robot stands, walks or drives in the simulated plant under noisy sensors. At every tick each
+variant of the synchronisation gets the same measurement. At every tenth tick the planner's
+prediction (planning model, low-level policy with the plant's memory) starts from each variant's
+state and from the true one. Printed are the RMS differences of the predicted base displacements
+after 60 and 200 ms, and the RMS errors of the states themselves.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from xop_lerobot.retarget.rollout import PolicyRollout
 from xop_lerobot.retarget.sync.config import SyncConfig
 from xop_lerobot.retarget.sync.state_sync import StateSync
 
-TICK = 0.04  # of the teleoperator [s]
+TICK = 0.04  # period of the teleoperation [s]
 HORIZONS = (3, 10)  # 60 and 200 ms [control steps]
 EVERY = 10  # ticks between predictions
-SETTLE_S = 2.0  # not counted: transients of robot and filters
+SETTLE_S = 2.0  # excluded start: transients of robot and filters [s]
 
 VARIANTS = {
     "NLS": SyncConfig(recursive=False, project_velocity=False),
@@ -43,20 +43,20 @@ VARIANTS = {
     "NLS + velocity + memory": SyncConfig(),
     "all, and the prediction": SyncConfig(),
 }
-"""Ways to synchronise; raw is the measurement as it is."""
+"""Variants of the synchronisation, in addition to `raw`, the unchanged measurement."""
 PREDICTED = "all, and the prediction"
-"""The one that also gets the base's velocity that was predicted from its own last state, as in a
-teleoperation, where the last plan tells it."""
+"""The variant that also gets the base velocity predicted from its own last state, as in
+teleoperation, where it comes from the last plan."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A robot that does something.
+    """A robot and its motion.
 
     Attributes:
-        robot: Its name.
-        mode: Mode it is in.
-        command: Entries of the command that are not neutral [their unit].
+        robot: Name of the robot.
+        mode: Mode of the command.
+        command: Offsets of command entries from neutral, in their units.
     """
 
     robot: str
@@ -75,7 +75,7 @@ CASES = {
 
 @dataclass
 class Errors:
-    """What one way of synchronising got wrong: one entry per tick or per prediction."""
+    """Errors of one variant, one entry per tick or per prediction."""
 
     position: list[float] = field(default_factory=list)  # of the base [m]
     height: list[float] = field(default_factory=list)  # of the base [m]
@@ -87,7 +87,7 @@ class Errors:
     seconds: list[float] = field(default_factory=list)  # per solve [s]
 
     def add_state(self, state: RobotState, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Compare a state with the truth."""
+        """Add the errors of a state (qpos, qvel) against the true one."""
         truth = state.true_qpos
         self.position.append(float(np.linalg.norm(qpos[:3] - truth[:3])))
         self.height.append(float(qpos[2] - truth[2]))
@@ -99,7 +99,7 @@ class Errors:
 
 
 def run(case: Case, noise: str, seed: int, duration: float, errors: dict[str, Errors]) -> None:
-    """Run one episode and add its errors."""
+    """Run one episode of `duration` [s] and add its errors by variant."""
     morphology = make_morphology(case.robot)
     policy = make_policy(morphology.policies[0])
     model = build_model(morphology, "planning")
@@ -139,7 +139,7 @@ def run(case: Case, noise: str, seed: int, duration: float, errors: dict[str, Er
 
 
 def _make_action(morphology: Morphology, case: Case, time_s: float) -> RobotAction:
-    """The case's command, taken back and forth every 4 s where it is about posture."""
+    """Return the case's command; posture entries alternate with neutral every 2 s."""
     action = morphology.rest_action()
     space = morphology.command_space
     for name, value in case.command.items():
@@ -156,7 +156,7 @@ def _predict(
     qpos: np.ndarray,
     qvel: np.ndarray,
 ) -> np.ndarray:
-    """Predicted displacement of the base from its start [m]. Shape (H + 1, 3)."""
+    """Predict the displacement of the base from its start [m]. Shape (H + 1, 3)."""
     commands = np.broadcast_to(action.command, (1, max(HORIZONS), len(action.command)))
     predicted = rollout.predict(qpos, qvel, state.memory, commands, action.arms, action.mode)
     return predicted.qpos[0, :, :3] - qpos[:3]
@@ -169,7 +169,7 @@ def _predict_velocity(
     qpos: np.ndarray,
     qvel: np.ndarray,
 ) -> np.ndarray:
-    """Predicted linear velocity of the base a tick later [m/s]. Shape (3,)."""
+    """Predict the linear velocity of the base one tick later [m/s]. Shape (3,)."""
     steps = round(TICK / POLICY_DT)
     commands = np.broadcast_to(action.command, (1, steps, len(action.command)))
     predicted = rollout.predict(qpos, qvel, state.memory, commands, action.arms, action.mode)
@@ -177,7 +177,7 @@ def _predict_velocity(
 
 
 def _compute_up(quat: np.ndarray) -> np.ndarray:
-    """World's vertical in the body [1]. Shape (3,)."""
+    """Return the world's vertical in the body frame, a unit vector. Shape (3,)."""
     w, x, y, z = quat
     return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
 
@@ -187,7 +187,7 @@ def _rms(values: list[float]) -> float:
 
 
 def print_table(title: str, errors: dict[str, Errors]) -> None:
-    """Print one case."""
+    """Print the errors of one case, a row per variant."""
     count = len(errors["raw"].predicted[HORIZONS[0]])
     print(f"\n{title}: {count} predictions, {len(errors['raw'].position)} states; RMS")
     print(
@@ -213,7 +213,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--noise", default="mild", help="noise preset of the sensors")
     parser.add_argument("--seeds", type=int, default=3, help="episodes per case, seeds 0, 1, …")
-    parser.add_argument("--duration", type=float, default=12.0, help="of an episode [s]")
+    parser.add_argument("--duration", type=float, default=12.0, help="duration of an episode [s]")
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
     args = parser.parse_args()
     print(f"noise {args.noise}, seeds 0 to {args.seeds - 1}, {args.duration} s each")

@@ -1,10 +1,10 @@
-"""Run tasks of a simulated person with parts of the retargeter left out.
+"""Run a task with the simulated person and with parts of the retargeter removed.
 
     python -m benchmarks.run_tasks --robot rby1 --task box_pick_and_place --trials 20 \
         --ablations default,no_bias,no_hold,no_yield --json outputs/tasks.json
 
 The trials are those of `xop-eval --methods mpc`, the ablations those of `benchmarks.run_tracking`.
-Trials that the JSON file holds already are not run again.
+Trials that the JSON file already contains are not run again.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from xop_lerobot.morphology.tuning import MpcConfig
 
 @contextmanager
 def leave_out(ablation: Ablation, robot: str) -> Iterator[None]:
-    """Put an ablation's settings and replacements in place for one robot.
+    """Apply an ablation's planner settings and replacements to one robot.
 
     Raises:
-        BadValue: If the ablation asks for more than those.
+        BadValue: If the ablation changes anything else.
     """
     if ablation.preset or ablation.retargeter or ablation.noise or ablation.equal_compute:
-        raise BadValue(f"'{ablation.title}' is for benchmarks.run_tracking alone")
+        raise BadValue(f"'{ablation.title}' works only in benchmarks.run_tracking")
     kind = type(make_morphology(robot))
     stock = kind.mpc_config
 
@@ -52,7 +52,7 @@ def leave_out(ablation: Ablation, robot: str) -> Iterator[None]:
 
 
 def summarise(trials: Sequence[dict[str, Any]]) -> str:
-    """One row of the table: successes, falls, collisions, mean time of the successes."""
+    """Format a table row: successes, falls, collisions, mean time of the successes [s]."""
     times = [each["completion_s"] for each in trials if each["success"]]
     mean = f"{sum(times) / len(times):.1f}" if times else "–"
     falls = sum(bool(each["fallen"]) for each in trials)
@@ -65,12 +65,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--robot", default="rby1", help="the robot (default: rby1)")
-    parser.add_argument("--task", default="box_pick_and_place", help="the task")
-    parser.add_argument("--ablations", default="default", help="names with commas")
-    parser.add_argument("--trials", type=int, default=20, help="trials each (default: 20)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first (default: 0)")
-    parser.add_argument("--json", type=Path, help="results, added to what it holds")
+    parser.add_argument("--robot", default="rby1", help="robot (default: rby1)")
+    parser.add_argument("--task", default="box_pick_and_place", help="task")
+    parser.add_argument("--ablations", default="default", help="names, separated by commas")
+    parser.add_argument("--trials", type=int, default=20, help="trials per ablation (default: 20)")
+    parser.add_argument("--seed", type=int, default=0, help="first seed (default: 0)")
+    parser.add_argument("--json", type=Path, help="file of the results, which is extended")
     args = parser.parse_args(arguments)
 
     records: dict[str, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""Measure in closed loop how well the robots track goals of the head.
+"""Measure in closed loop how well robots track goals of the head.
 
     python -m benchmarks.run_tracking --robot g1 --scenarios squat,yaw --seeds 3 --jobs 1
     python -m benchmarks.run_tracking --robot rby1 --scenarios diagonal --plot diagonal.png
@@ -7,8 +7,8 @@
         --ablations default,table1 --jobs 2 --json outputs/tracking.json
     python -m benchmarks.run_tracking --json outputs/tracking.json --write-docs
 
-Errors are those of the true head. A key figure is printed per run, a table of median / worst over
-the seeds at the end. Runs that the JSON file holds already are not run again.
+Errors are those of the head's true pose. Key metrics are printed per run, a table of median / worst
+over the seeds at the end. Runs that the JSON file already contains are not run again.
 """
 
 from __future__ import annotations
@@ -52,38 +52,42 @@ GROUPS = {
 
 
 def parse_args(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Read the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
     add("--robot", default="g1", help=f"{say_robots()}, or all (default: g1)")
-    add("--scenarios", default="all", help=f"names with commas: {', '.join(SCENARIOS)}; or "
-        f"{', '.join(GROUPS)} (default: all, which leaves out room and arms)")  # fmt: skip
-    add("--ablations", default="default", help=f"names with commas, or all: {', '.join(ABLATIONS)}")
+    add(
+        "--scenarios",
+        default="all",
+        help=f"names, separated by commas: {', '.join(SCENARIOS)}; or groups: "
+        f"{', '.join(GROUPS)} (default: all, which is stationary, mobile and curve)",
+    )
+    add(
+        "--ablations",
+        default="default",
+        help=f"names, separated by commas, or all: {', '.join(ABLATIONS)}",
+    )
     add("--seeds", type=int, default=10, help="number of seeds (default: 10)")
-    add("--first-seed", type=int, default=0, help="the first of them (default: 0)")
-    add("--jobs", type=int, default=1, help="processes, one thread each (default: 1)")
+    add("--first-seed", type=int, default=0, help="first seed (default: 0)")
+    add("--jobs", type=int, default=1, help="parallel processes of one thread (default: 1)")
     add("--noise", default="mild", help="sensor noise: off, mild or harsh (default: mild)")
     add("--preset", default="default", help="preset of the retargeter (default: default)")
     add("--no-sync", action="store_true", help="do not synchronise the state")
     add("--low-level", default="", help="low-level policy (default: the robot's own)")
-    add("--low-level-path", default="", help="its file (default: its own)")
-    add("--hold", type=float, default=10.0, help="how long goals are held [s] (default: 10)")
+    add("--low-level-path", default="", help="file of that policy (default: its own)")
+    add("--hold", type=float, default=10.0, help="time for which goals are held [s] (default: 10)")
     add("--goals", type=int, default=10, help="goals per run of `room` (default: 10)")
     add("--payload", type=float, default=0.0,
-        help="mass in each hand that the planner does not know [kg] (default: 0)")  # fmt: skip
+        help="mass in each hand, unknown to the planner [kg] (default: 0)")  # fmt: skip
     add("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings",
         help="override a setting of MpcConfig: horizon=20, mobile.weights.control=0.01, "
         "noise_std.vx=0.2; may be repeated")  # fmt: skip
-    add("--json", type=Path, help="results, added to what it holds; also resumes")
-    add("--fresh", action="store_true", help="forget what the JSON file holds")
-    add("--plot", type=Path, help="draw the first run into this picture and stop")
-    add(
-        "--write-docs",
-        action="store_true",
-        help=f"fill {DOCUMENT} from --json and stop",
-    )
+    add("--json", type=Path, help="file of the results, which is extended; also resumes")
+    add("--fresh", action="store_true", help="discard the runs in the JSON file")
+    add("--plot", type=Path, help="plot the first run to this file and stop")
+    add("--write-docs", action="store_true", help=f"fill {DOCUMENT} from --json and stop")
     add("--bench", type=Path, nargs="+", default=[], metavar="FILE",
         help="JSON files of xop-bench for --write-docs")  # fmt: skip
     args = parser.parse_args(arguments)
@@ -95,7 +99,7 @@ def parse_args(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def make_setups(args: argparse.Namespace) -> list[TrackingSetup]:
-    """Every combination that is asked for.
+    """Make the setups of all requested combinations of ablation, robot and scenario.
 
     Raises:
         UnknownName: If a robot, scenario or ablation is unknown.
@@ -132,7 +136,11 @@ def make_setups(args: argparse.Namespace) -> list[TrackingSetup]:
 
 
 def run_all(args: argparse.Namespace, setups: list[TrackingSetup], results: Results) -> list[str]:
-    """Run what is missing and return the keys of all that was asked for."""
+    """Run the missing trials and return the keys of all requested ones.
+
+    Raises:
+        XopError: If a run fails.
+    """
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     trials = [(setup, seed) for setup in setups for seed in seeds]
     keys = [setup.compute_key(seed) for setup, seed in trials]
@@ -166,7 +174,7 @@ def _run(job: tuple[str, TrackingSetup, int]) -> dict[str, Any]:
 
 
 def print_tables(setups: list[TrackingSetup], runs: dict[str, dict[str, Any]]) -> None:
-    """Print median / worst over the seeds of what was asked for."""
+    """Print tables of median / worst over the seeds of the requested runs."""
     ablations = list(dict.fromkeys(setup.ablation for setup in setups))
     for robot in dict.fromkeys(setup.robot for setup in setups):
         asked = {setup.scenario for setup in setups}
@@ -182,7 +190,7 @@ def print_tables(setups: list[TrackingSetup], runs: dict[str, dict[str, Any]]) -
 
 
 def plot_first(args: argparse.Namespace, setup: TrackingSetup) -> None:
-    """Run one seed, print its figures and draw it."""
+    """Run the first seed, print its metrics and plot it."""
     from benchmarks.tracking_plot import plot_run
 
     start = perf_counter()
@@ -192,7 +200,7 @@ def plot_first(args: argparse.Namespace, setup: TrackingSetup) -> None:
     names = make_morphology(setup.robot).command_space.names
     plot_run(args.plot, f"{key} ({setup.resolved_noise} noise)", track, trajectory, names)
     print(describe_run(key, run))
-    print(f"drawn: {args.plot}")
+    print(f"written: {args.plot}")
 
 
 def main() -> int:

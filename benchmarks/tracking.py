@@ -1,8 +1,8 @@
-"""Closed-loop tracking: a scenario's goals drive a robot in lock-step, and the truth is measured.
+"""Closed-loop tracking runs: a scenario's goals drive a robot in lock-step, with errors of truth.
 
-The whole of teleoperation is in the loop, state synchronisation, retargeter, arm kinematics and
-limits, but for two parts: no person, and no alignment. Goals are given in the robot's world, so
-that an error is the robot's and not that of where it believed to be when it was engaged.
+The loop contains all of teleoperation (state synchronisation, retargeter, arm kinematics, limits)
+except a person and the alignment. Goals are given in the world frame, so that errors exclude the
+robot's error of its own pose when it was engaged.
 """
 
 from __future__ import annotations
@@ -53,21 +53,20 @@ from xop_lerobot.session import Tick
 from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 
 TRACE_DT = 0.2
-"""Time between the points of a run's trace [s]."""
-OPEN_PINCH = 0.1  # distance of thumb and index of an open hand [m]
-
-
+"""Sample time of a run's trace [s]."""
+OPEN_PINCH = 0.1
+"""Distance between thumb and index tip of an open hand [m]."""
 SETTLE_S, LOADED_SETTLE_S = 1.0, 3.0
-"""Time in which a robot settles before a scenario begins, and one with a payload [s]."""
+"""Time in which a robot settles before a scenario begins, without and with a payload [s]."""
 
 
 class GoalDevice(Device):
-    """An operator who has the goals themselves as head and hands, in the robot's world.
+    """An operator whose head and hands are the goals themselves, in the world frame.
 
     Args:
         scenario: The scenario.
         track: Its goals.
-        wrists: Poses of the wrists at home. Shapes (7,).
+        wrists: Initial poses of the wrists by name, in the world. Shapes (7,).
     """
 
     self_engaging = True
@@ -86,11 +85,11 @@ class GoalDevice(Device):
         self._start = time
 
     def clock(self, time: float) -> float:
-        """Track's clock at `time` of the robot's; 0 before the start [s]."""
+        """Convert the robot's `time` to the track's clock; 0 before the start [s]."""
         return 0.0 if self._start is None else time - self._start
 
     def read(self, time: float) -> OperatorFrame:
-        """The goals at `time`."""
+        """Return the goals at `time` [s] as an operator frame."""
         clock = self.clock(time)
         head = self.track.head_at(clock)
         return OperatorFrame(
@@ -103,7 +102,7 @@ class GoalDevice(Device):
         )
 
     def _compute_wrist(self, name: str, head: np.ndarray, clock: float) -> np.ndarray:
-        """A wrist goes with the head's place and heading. Shape (7,)."""
+        """Compute a wrist's pose, which follows the head's position and heading. Shape (7,)."""
         wrist = self._from_head[name]
         reach = self.track.reach
         if reach is not None and clock >= self.track.reach_start:
@@ -113,7 +112,7 @@ class GoalDevice(Device):
 
 
 class WorldAlignment(Alignment):
-    """No alignment: what the operator does is wanted in the robot's world as it is."""
+    """The identity alignment: the operator's poses are goals in the world frame."""
 
     def __init__(self) -> None:
         super().__init__(AlignmentConfig(height_scale=1.0, reach_scale=1.0))
@@ -131,28 +130,28 @@ class WorldAlignment(Alignment):
         robot_head_height: float,
         robot_reach: float | None = None,
     ) -> None:
-        """Begin to give goals."""
+        """Engage; the arguments are not used."""
         del frame, robot_frames, robot_head_height, robot_reach
         self._engaged = True
 
     def disengage(self) -> None:
-        """Give no goals."""
+        """Disengage."""
         self._engaged = False
 
     def goal_poses(self, frame: OperatorFrame) -> dict[str, np.ndarray]:
-        """The operator's poses. Shapes (7,)."""
+        """Return the operator's poses as goals, by frame. Shapes (7,)."""
         return {name: frame.pose(name).copy() for name in FRAMES}
 
 
 def locate_frames(morphology: Morphology, qpos: np.ndarray) -> dict[str, np.ndarray]:
-    """Find the tracked frames in one or many configurations. Shape (..., nq) -> (..., 7) each."""
+    """Compute the world poses of the tracked frames by name. Shape (..., nq) -> (..., 7) each."""
     model = build_model(morphology, "planning")
     poses = SiteKinematics(model, tuple(morphology.frames.values())).compute_poses(qpos)
     return {name: poses[site] for name, site in morphology.frames.items()}
 
 
 def get_scenario(name: str) -> Scenario:
-    """Look the scenario `name` up.
+    """Return the scenario `name`.
 
     Raises:
         UnknownName: Listing the known ones.
@@ -163,10 +162,11 @@ def get_scenario(name: str) -> Scenario:
 
 
 def make_loaded_model(morphology: Morphology, setup: TrackingSetup, scene: str) -> mujoco.MjModel:
-    """Make the plant's model, with the payload in its hands."""
+    """Make the plant's model, with the setup's payload in each hand."""
     model = build_model(morphology, "full", scene=scene)
     if setup.payload:
         for name in FRAMES[1:]:
+            # The payload has the shape of the hand: its inertia grows in proportion to its mass.
             hand = int(model.site(morphology.frames[name]).bodyid[0])
             mass = model.body_mass[hand]
             model.body_inertia[hand] *= (mass + setup.payload) / mass
@@ -183,7 +183,10 @@ def run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajectory
         seed: Seed of sensors, samples and random goals.
 
     Returns:
-        The goals, and what happened.
+        The goals and the true trajectory.
+
+    Raises:
+        UnknownName: If the setup names an unknown scenario, robot or ablation.
     """
     with get_ablation(setup.ablation).replace():
         return _run_scenario(setup, seed)
@@ -198,7 +201,7 @@ def _run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajector
     policy = (setup.low_level, setup.low_level_path)
     with closed_loop(plant, teleoperated, *policy, fps=setup.fps, seed=seed) as pair:
         loop, teleoperation = pair
-        # What is put into the hands makes a robot sink and lean before it has found its balance.
+        # An unexpected payload makes a robot sink and lean until it has found its balance.
         loop.reset(seed, settle_s=LOADED_SETTLE_S if setup.payload else SETTLE_S)
         frames = locate_frames(morphology, loop.state.true_qpos)
         home = level_pose(frames["head"])
@@ -212,7 +215,7 @@ def _run_scenario(setup: TrackingSetup, seed: int) -> tuple[GoalTrack, Trajector
 
 
 def _drive(loop: PolicyLoop, teleoperation: Teleoperation, track: GoalTrack) -> Trajectory:
-    """Close the loop for the length of the track, and write down what is true."""
+    """Run the loop for the duration of the track, and record the true trajectory."""
     rows, contacts = TraceRows(), set[tuple[str, str]]()
     device, dt = teleoperation.device, teleoperation.dt
     assert isinstance(device, GoalDevice)
@@ -230,7 +233,7 @@ def _drive(loop: PolicyLoop, teleoperation: Teleoperation, track: GoalTrack) -> 
     trace = rows.make_trace()
     frames = locate_frames(loop.morphology, trace.qpos)
     goal = trace.goals["head"]
-    for tick in np.flatnonzero(np.isnan(goal[:, 0])):  # the robot has let go
+    for tick in np.flatnonzero(np.isnan(goal[:, 0])):  # disengaged, but errors still count
         goal[tick] = track.head_at(clocks[tick])
     offsets = [trace.goals[name][:, :3] - frames[name][:, :3] for name in FRAMES[1:]]
     return Trajectory(
@@ -250,12 +253,10 @@ def _drive(loop: PolicyLoop, teleoperation: Teleoperation, track: GoalTrack) -> 
 
 
 def run_trial(setup: TrackingSetup, seed: int) -> dict[str, Any]:
-    """Run one scenario and compute its figures.
+    """Run one scenario and compute its metrics.
 
     Returns:
-        ``setup``, ``seed``, ``metrics``, ``samples``, ``horizon``, ``control_hz``,
-        ``physics_steps_per_s``, ``contacts``, ``wall_s`` and more, all fit for JSON: what never
-        came, as an arrival, is None.
+        The record of the run, see `make_record`.
     """
     start = perf_counter()
     track, trajectory = run_scenario(setup, seed)
@@ -265,7 +266,13 @@ def run_trial(setup: TrackingSetup, seed: int) -> dict[str, Any]:
 def make_record(
     setup: TrackingSetup, seed: int, track: GoalTrack, trajectory: Trajectory, wall_s: float
 ) -> dict[str, Any]:
-    """Put the figures of a run and what it ran with in one place, fit for JSON."""
+    """Make the JSON record of a run.
+
+    Returns:
+        ``setup``, ``seed``, ``metrics``, ``samples``, ``horizon``, ``control_hz``,
+        ``physics_steps_per_s``, ``contacts``, ``wall_s`` and more. Metrics that are not finite,
+        as the time of an arrival that never happened, are None.
+    """
     scenario = get_scenario(setup.scenario)
     metrics = compute_metrics(track, trajectory, scenario.get_tolerance(setup.robot))
     config = resolve_configs(setup)[scenario.mode]
@@ -296,7 +303,11 @@ def make_record(
 
 
 def make_trace(track: GoalTrack, trajectory: Trajectory) -> dict[str, Any]:
-    """The instant position error over time, five times a second, for plots."""
+    """Sample the instantaneous position error every `TRACE_DT`, for plots.
+
+    Returns:
+        ``dt`` [s], ``position_cm``, and ``limits``: when each goal should be reached [s].
+    """
     errors = compute_errors(trajectory, [step.start for step in track.steps])
     times = np.arange(0, trajectory.time[-1] + 1e-9, TRACE_DT)
     position = np.interp(times, trajectory.time, errors.position) * 100

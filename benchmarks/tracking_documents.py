@@ -1,4 +1,4 @@
-"""Fills the tables of docs/results/benchmarks.md from the results of the benchmarks."""
+"""Generation of the tables and plots of docs/results/benchmarks.md from result files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ VARIANTS = {
     },
     "sync": {name: ABLATIONS[name] for name in SYNC_VARIANTS},
 }
-"""Variants of the retargeter itself, and of state synchronisation and noise, by table."""
+"""Variants by table: of the retargeter itself, and of state synchronisation and noise."""
 ASKED = (
     "g1 stationary ablations",
     "g1 mobile ablations",
@@ -46,24 +46,24 @@ ASKED = (
     "g1 mobile sync",
     "rby1 mobile sync",
 )
-"""Tables of variants that the document has."""
+"""Tables of variants in the document, by the names of their markers."""
 
 
 def write_documents(root: Path, results: Path, benches: Sequence[Path] = ()) -> list[str]:
-    """Put tables of results between the markers of docs/results/benchmarks.md.
+    """Replace the tables of results between the markers of docs/results/benchmarks.md.
 
-    Runs that were made with settings which are no longer the robots' own are left out.
+    Runs whose settings differ from the robots' current ones are left out.
 
     Args:
-        root: The repository.
+        root: Root of the repository.
         results: JSON file of benchmarks/run_tracking.py.
         benches: JSON files of xop-bench, in the order of the table.
 
     Returns:
-        What was done, a line each.
+        Messages on what was written and left out.
 
     Raises:
-        BadValue: If a file holds no results, or the document lacks a marker.
+        BadValue: If a file is missing or contains no results, or the document lacks a marker.
     """
     for path in (results, *benches):
         if not path.exists():
@@ -84,14 +84,14 @@ def write_documents(root: Path, results: Path, benches: Sequence[Path] = ()) -> 
 
 
 def draw_plots(folder: Path, runs: Mapping[str, Run]) -> dict[str, str]:
-    """Draw the errors of each robot's runs over time, where variants were held as long.
+    """Plot the errors of each robot's runs over time, at the longest hold its variants have.
 
     Args:
-        folder: Folder of the documents; pictures go to ``images``.
+        folder: Folder of the documents; plots go to ``images``.
         runs: Runs by key.
 
     Returns:
-        Blocks with the pictures.
+        Markdown links to the plots, by the name of their markers.
     """
     blocks = {}
     names = [name for kind in PLOTTED for name in SCENARIO_GROUPS[kind]]
@@ -101,14 +101,14 @@ def draw_plots(folder: Path, runs: Mapping[str, Run]) -> dict[str, str]:
         holds = [run["hold"] for run in variants or own.values()]
         if not holds:
             continue
-        picture = f"images/tracking_{robot}.png"
-        if plot_variants(folder / picture, _keep_holds(own, {max(holds)}), robot, names):
-            blocks[f"{robot} plot"] = f"![Position error over time, {robot}](../{picture})"
+        image = f"images/tracking_{robot}.png"
+        if plot_variants(folder / image, _keep_holds(own, {max(holds)}), robot, names):
+            blocks[f"{robot} plot"] = f"![Position error over time, {robot}](../{image})"
     return blocks
 
 
 def is_current(key: str, run: Run) -> bool:
-    """Whether a run was made as the ablation of that name is now."""
+    """Return whether a run was made with the current settings of its ablation, and no others."""
     try:
         setup = TrackingSetup(**run["setup"])
         return setup.is_standard and setup.compute_key(run["seed"]) == key
@@ -117,10 +117,10 @@ def is_current(key: str, run: Run) -> bool:
 
 
 def make_blocks(runs: Mapping[str, Run], machine: Mapping[str, Any]) -> dict[str, str]:
-    """Tables by the name of their markers; those without a run are left as they are.
+    """Make the tables by the names of their markers; tables without a run are omitted.
 
-    Tables of scenarios take the runs with the longest hold, tables of variants those that were
-    held as long as the variants, of the same scenarios and seeds.
+    Tables of scenarios use the default's runs with the longest hold. Tables of variants use the
+    default's runs with the variants' holds, scenarios and seeds.
     """
     blocks = {"machine": describe_conditions(runs, machine)}
     for robot in ROBOTS:
@@ -153,9 +153,9 @@ def _keep_holds(runs: Mapping[str, Run], holds: Collection[float]) -> dict[str, 
 
 
 def _keep_alike(runs: Mapping[str, Run], variants: Collection[str]) -> dict[str, Run]:
-    """Keep the default's runs of those scenarios and seeds that a variant was run with too.
+    """Keep the runs of those scenarios and seeds that some variant was run with.
 
-    Rows of one table are compared: they must not be over different goals.
+    Rows of one table are compared, so they must have the same goals.
     """
     ran = {
         (run["scenario"], run["seed"])
@@ -166,7 +166,7 @@ def _keep_alike(runs: Mapping[str, Run], variants: Collection[str]) -> dict[str,
 
 
 def describe_conditions(runs: Mapping[str, Run], machine: Mapping[str, Any]) -> str:
-    """Machine, versions, seeds and holds in two sentences."""
+    """Describe machine, versions, seeds and holds in two sentences."""
     seeds = sorted({run["seed"] for run in runs.values()})
     stock = [run for run in runs.values() if run["ablation"] == "default"] or list(runs.values())
     holds = sorted({run["hold"] for run in stock})

@@ -1,7 +1,7 @@
-"""Figures of one run of the tracking benchmark, all on the true pose of the head.
+"""Metrics of one run of the tracking benchmark, of the head's true pose.
 
-A walking robot's head sways with each step. Hence every error is given twice: *instant*, as it is
-in each tick, and *mean*, the error of the pose averaged over the last second.
+A walking robot's head sways with each step. Hence every error is given twice: *instant*, per tick,
+and *mean*, the norm of the error vector averaged over the last second.
 """
 
 from __future__ import annotations
@@ -19,27 +19,30 @@ from xop_lerobot.core.transforms import rotation_error
 WINDOW_S = 1.0
 """Window of the mean errors [s]."""
 MOVING_AFTER_S = 2.0
-"""A moving goal's error counts from this long after it has started to move [s]."""
+"""Time after a moving goal's start from which its error counts [s]."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What happened, tick by tick; all poses are true ones, x y z qw qx qy qz.
+    """Trajectory of a run, per tick; poses are true, in the world, x y z qw qx qy qz.
 
     Attributes:
         time: Track's clock [s]. Shape (n,).
         head: Pose of the head. Shape (n, 7).
         goal: Goal of the head. Shape (n, 7).
         base: Pose of the base. Shape (n, 7).
-        command: Command that was executed. Shape (n, k).
-        feet: Place of every foot or wheel, the mean of its points. Shape (n, f, 3).
+        command: Executed command. Shape (n, k).
+        feet: Position of each foot or wheel, the mean of its contact points [m]. Shape (n, f, 3).
         hands: Distance of each wrist from its goal [m]. Shape (n, 2).
         fallen: Whether the robot has fallen. Shape (n,), bool.
-        collision: Whether it touched anything in the tick. Shape (n,), bool.
+        collision: Whether the robot collided in the tick. Shape (n,), bool.
         solve_s: Time of each solve [s]. Shape (m,).
-        contacts: Pairs of bodies that were seen to touch.
+        contacts: Pairs of bodies in collision at any tick.
         failed: Whether each solve had no sample of finite cost. Shape (m,), bool.
         intervened: Whether the retargeter slowed or vetoed each plan. Shape (m,), bool.
+
+    Raises:
+        BadShape: If an array does not have an entry per tick.
     """
 
     time: np.ndarray
@@ -65,13 +68,13 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of the head in every tick.
+    """Errors of the head per tick.
 
     Attributes:
         position: Distance to the goal [m]. Shape (n,).
         angle: Angle of the rotation to the goal [rad]. Shape (n,).
-        mean_position: The same of the pose averaged over the last second [m]. Shape (n,).
-        mean_angle: The same [rad]. Shape (n,).
+        mean_position: Norm of the position error averaged over `WINDOW_S` [m]. Shape (n,).
+        mean_angle: Norm of the rotation error averaged over `WINDOW_S` [rad]. Shape (n,).
     """
 
     position: np.ndarray
@@ -80,7 +83,7 @@ class Errors:
     mean_angle: np.ndarray
 
     def find_within(self, tolerance: Tolerance, *, mean: bool = False) -> np.ndarray:
-        """Whether each tick is within `tolerance`. Shape (n,), bool."""
+        """Return whether each tick's (mean) errors are within `tolerance`. Shape (n,), bool."""
         position, angle = self.position, self.angle
         if mean:
             position, angle = self.mean_position, self.mean_angle
@@ -90,12 +93,12 @@ class Errors:
 def compute_errors(trajectory: Trajectory, starts: Sequence[float] = ()) -> Errors:
     """Compute the errors of every tick.
 
-    The mean is that of the error *vectors*, over the window before each tick or what of it
-    belongs to the same goal: a sway about the goal averages out, an offset does not.
+    Mean errors average the error *vectors* over the window before each tick, or the part of it
+    with the same goal: a sway about the goal averages out, an offset does not.
 
     Args:
-        trajectory: What happened.
-        starts: When the goal stepped [s].
+        trajectory: The trajectory.
+        starts: Times at which the goal stepped [s].
     """
     goal, head = trajectory.goal, trajectory.head
     offset = head[:, :3] - goal[:, :3]
@@ -114,7 +117,7 @@ def compute_errors(trajectory: Trajectory, starts: Sequence[float] = ()) -> Erro
 
 
 def _average_last(time: np.ndarray, values: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Mean over the ticks of the last `WINDOW_S`, not before the tick `first[i]`. (n, d)."""
+    """Average each tick's last `WINDOW_S`, not before tick `first[i]`. Shape (n, d)."""
     sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     start = np.maximum(np.searchsorted(time, time - WINDOW_S + 1e-9), first)
     end = np.arange(len(time)) + 1
@@ -124,14 +127,22 @@ def _average_last(time: np.ndarray, values: np.ndarray, first: np.ndarray) -> np
 def compute_step_metrics(
     step: GoalStep, end: float, time: np.ndarray, errors: Errors, tolerance: Tolerance
 ) -> dict[str, float]:
-    """Figures of one held goal, from its start to `end` [s].
+    """Compute the metrics of one held goal, from its start to `end` [s].
+
+    Args:
+        step: The goal.
+        end: End of the goal on the track's clock [s].
+        time: Track's clock of each tick [s]. Shape (n,).
+        errors: Errors of each tick.
+        tolerance: Errors that count as arrived.
 
     Returns:
         ``arrival_s``, ``arrival_mean_s``: time from the step until the errors are first within
-        the tolerance, infinite if never; ``at_limit_*``: error when it shall be there;
-        ``after_*``: from then on, as worst (``max``), 95th percentile and median; ``final_*``:
-        the last. Those of the mean errors begin `WINDOW_S` later, when the whole window lies
-        behind the time to arrive.
+        the tolerance, infinite if never; ``late_s``, ``late_mean_s``: the same less the time of
+        the direct path; ``at_limit_*``: error at the time limit; ``after_*``: errors from then
+        on, as worst (``max``), 95th percentile and median; ``final_*``: last error;
+        ``outside_share``: fraction of ticks out of tolerance after the limit. Those of the mean
+        errors begin `WINDOW_S` later, when the whole window is past the limit.
     """
     since = (time >= step.start - 1e-9) & (time < end - 1e-9)
     limit = step.start + step.limit_s
@@ -164,15 +175,16 @@ def _first(time: np.ndarray, mask: np.ndarray) -> float:
 def compute_metrics(
     track: GoalTrack, trajectory: Trajectory, tolerance: Tolerance
 ) -> dict[str, float]:
-    """Compute the figures of one run; of several goals the worst counts.
+    """Compute the metrics of one run.
 
     Returns:
-        For goals that step, the worst of `compute_step_metrics` over the goals. For one that
-        moves ``moving_*``: mean, worst and 95th percentile of the error. For all: ``foot_cm``,
-        the largest travel of a foot; ``hand_cm``, the median distance of the hands;
-        ``tilt_deg``, the largest tilt of the base; ``falls`` and ``collisions`` (0 or 1),
-        ``collided_goals``, ``failed_percent`` and ``intervened_percent`` of the solves, and
-        ``solve_ms`` and ``solve_p99_ms``.
+        For goals that step: the worst of `compute_step_metrics` over the goals, and the numbers
+        ``goals``, ``arrived_goals`` and ``collided_goals``. For one that moves, ``moving_*``:
+        mean, worst and 95th percentile of the error. For all: ``foot_cm``, the largest
+        displacement of a foot from its start; ``hand_cm``, the median distance of the hands from
+        their goals; ``tilt_deg``, the largest tilt of the base; ``falls`` and ``collisions``
+        (0 or 1); ``failed_percent`` and ``intervened_percent`` of the solves; ``solve_ms`` and
+        ``solve_p99_ms``, the median and 99th percentile of the solve time.
     """
     errors = compute_errors(trajectory, [step.start for step in track.steps])
     time = trajectory.time

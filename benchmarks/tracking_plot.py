@@ -1,4 +1,4 @@
-"""Pictures of the tracking benchmark; needs matplotlib, which only developers install."""
+"""Plots of the tracking benchmark; needs matplotlib of the extra `dev`."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CHOSEN = {"default": "#1f77b4", "no_sync": "#2ca02c", "table1_equal": "#d95f02"}
-"""Variants that `plot_variants` draws, and their colours."""
+"""Variants in `plot_variants` and their colours."""
 GOAL, HEAD, BASE = "#888888", "#1f77b4", "#d95f02"
 
 
 def plot_run(
     path: Path, title: str, track: GoalTrack, trajectory: Trajectory, names: Sequence[str]
 ) -> None:
-    """Draw goal, head, base and commands over time, and the error.
+    """Plot goal, head, base, commands and errors of a run over time.
 
     Args:
-        path: Picture to write; its suffix is the format.
-        title: Title of the picture.
+        path: File to write; its suffix is the format.
+        title: Title of the figure.
         track: The goals.
-        trajectory: What happened.
-        names: Names of the commands. Length k.
+        trajectory: The trajectory.
+        names: Names of the command entries. Length k.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -84,6 +84,7 @@ def _plot_errors(axes: np.ndarray, track: GoalTrack, trajectory: Trajectory) -> 
         ax.plot(trajectory.time, mean, color=BASE, lw=1.5, label="1 s mean")
         for step in track.steps:
             ax.axvline(step.start + step.limit_s, color="k", lw=0.7, ls="--")
+        # The axis fits the settled part; the first error, the step itself, would dwarf it.
         settled = instant[trajectory.time > 0.3 * trajectory.time[-1]]
         ax.set_ylim(0, max(2.0, 2 * float(np.percentile(settled, 90))))
         ax.set_ylabel(label)
@@ -93,7 +94,7 @@ def _plot_errors(axes: np.ndarray, track: GoalTrack, trajectory: Trajectory) -> 
 def _plot_commands(
     axes: Sequence[Axes], time: np.ndarray, command: np.ndarray, names: Sequence[str]
 ) -> None:
-    """Velocities, postures less their first value, and how fast commands change."""
+    """Plot velocity commands, posture commands less their first value, and changes per tick."""
     fast = [i for i, name in enumerate(names) if name in ("vx", "vy", "v", "yaw_rate")]
     for ax, chosen, label in (
         (axes[0], fast, "velocity commands [m/s, rad/s]"),
@@ -111,7 +112,7 @@ def _plot_commands(
 
 
 def plot_floor(ax: Axes, trajectory: Trajectory) -> None:
-    """Draw the way of goal, head and base over the floor."""
+    """Plot the paths of goal, head and base on the floor."""
     for pose, color, label in (
         (trajectory.goal, GOAL, "goal"), (trajectory.base, BASE, "base"),
         (trajectory.head, HEAD, "head"),
@@ -123,16 +124,16 @@ def plot_floor(ax: Axes, trajectory: Trajectory) -> None:
 
 
 def plot_variants(path: Path, runs: Mapping[str, Run], robot: str, scenarios: Sequence[str]) -> int:
-    """Draw the position error over time of some variants: median, best and worst over the seeds.
+    """Plot the position error of some variants over time: median and range over the seeds.
 
     Args:
-        path: Picture to write.
-        runs: Runs by key, of one hold.
-        robot: The robot.
-        scenarios: A chart each.
+        path: File to write.
+        runs: Runs by key, all of one hold.
+        robot: Name of the robot.
+        scenarios: Names of the scenarios, one chart each.
 
     Returns:
-        How many curves were drawn; with none, nothing is written.
+        Number of curves; with none, no file is written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -168,7 +169,7 @@ def plot_variants(path: Path, runs: Mapping[str, Run], robot: str, scenarios: Se
 
 
 def _plot_band(ax: Axes, traces: Sequence[Mapping[str, Any]], color: str, label: str) -> None:
-    """Median of traces as a line, and their range; those that end early count until then."""
+    """Plot the median of traces and their range; traces may have different lengths."""
     longest = max(len(trace["position_cm"]) for trace in traces)
     values = np.full((len(traces), longest), np.nan)
     for row, trace in zip(values, traces, strict=True):

@@ -1,4 +1,4 @@
-"""Results of the tracking benchmark: kept in a JSON file, summed up in tables, put in the docs."""
+"""Results of the tracking benchmark: their JSON file, tables of them, and blocks of documents."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ Run = Mapping[str, Any]
 
 
 class Results:
-    """Runs by key in a JSON file; what is there need not run again.
+    """Runs by key, kept in a JSON file so that an interrupted benchmark can be resumed.
 
     Args:
-        path: The file; it is written anew after every run. None keeps nothing.
-        fresh: Whether to begin with none of its runs.
+        path: The file, rewritten atomically after every run; None for none.
+        fresh: Whether to discard the runs in the file.
+
+    Raises:
+        BadValue: If the file contains no results.
     """
 
     def __init__(self, path: Path | None, *, fresh: bool = False) -> None:
@@ -33,7 +36,7 @@ class Results:
             self.runs = read_runs(path)
 
     def add(self, key: str, run: dict[str, Any]) -> None:
-        """Keep a run, on disk at once."""
+        """Add a run and write the file."""
         self.runs[key] = run
         if self.path is None:
             return
@@ -52,7 +55,7 @@ def read_runs(path: Path) -> dict[str, dict[str, Any]]:
     """Read the runs of a results file.
 
     Raises:
-        BadValue: If it is none.
+        BadValue: If the file is not a results file.
     """
     try:
         return json.loads(path.read_text())["runs"]
@@ -119,7 +122,7 @@ ABLATION_COLUMNS = {
 
 
 def get_columns(scenario: Scenario) -> dict[str, str]:
-    """Figures by heading that tell a run of `scenario`."""
+    """Return the metrics that describe a run of `scenario`, by column heading."""
     special = {
         "curve": CURVE_COLUMNS,
         "room": ROOM_COLUMNS,
@@ -132,19 +135,16 @@ def get_columns(scenario: Scenario) -> dict[str, str]:
 
 
 def compute_median_and_worst(runs: Sequence[Run], metric: str) -> tuple[float, float]:
-    """Median and largest of a figure over runs; what never came counts as infinite."""
+    """Compute the median and the maximum of a metric over runs; None counts as infinite."""
     values = [run["metrics"].get(metric) for run in runs]
     numbers = np.array([math.inf if value is None else value for value in values], dtype=float)
     if not numbers.size:
         return math.nan, math.nan
-    ordered = np.sort(numbers)  # np.median of infinities is NaN
-    middle = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
-    median = middle[0] if middle[0] == middle[1] else sum(middle) / 2
-    return float(median), float(ordered[-1])
+    return float(np.median(numbers)), float(numbers.max())
 
 
 def format_number(value: float) -> str:
-    """A figure with two digits that tell something; ``never`` for an infinite one."""
+    """Format a number with one decimal below 100; ``never`` for infinity, ``–`` for NaN."""
     if math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -153,7 +153,7 @@ def format_number(value: float) -> str:
 
 
 def format_cell(runs: Sequence[Run], metric: str) -> str:
-    """``median / worst`` of a figure, or its sum where it is a count."""
+    """Format ``median / worst`` of a metric, or its sum if it is a count."""
     if metric in SUMMED:
         return format_number(sum(run["metrics"][metric] for run in runs))
     if all(metric not in run["metrics"] for run in runs):
@@ -163,7 +163,7 @@ def format_cell(runs: Sequence[Run], metric: str) -> str:
 
 
 def format_ratio(runs: Sequence[Run], base: Sequence[Run], metric: str) -> str:
-    """Median of a figure over that of the runs `base`."""
+    """Format the ratio of a metric's median to that of the runs `base`."""
     median, _ = compute_median_and_worst(runs, metric)
     reference, _ = compute_median_and_worst(base, metric)
     if not (math.isfinite(median) and math.isfinite(reference) and reference > 0):
@@ -172,7 +172,7 @@ def format_ratio(runs: Sequence[Run], base: Sequence[Run], metric: str) -> str:
 
 
 def select(runs: Mapping[str, Run], **wanted: Any) -> list[Run]:
-    """Runs whose entries are as wanted, in order of their seeds."""
+    """Return the runs whose entries equal `wanted`, ordered by seed."""
     found = [run for run in runs.values() if all(run[k] == v for k, v in wanted.items())]
     return sorted(found, key=lambda run: run["seed"])
 
@@ -180,7 +180,7 @@ def select(runs: Mapping[str, Run], **wanted: Any) -> list[Run]:
 def make_scenario_table(
     runs: Mapping[str, Run], robot: str, names: Sequence[str], ablation: str = "default"
 ) -> str:
-    """Table of scenarios of one kind, a row each; cells are ``median / worst`` over the seeds.
+    """Make a table of scenarios of one kind, a row each, of ``median / worst`` over the seeds.
 
     Raises:
         UnknownName: If there is no such scenario.
@@ -202,10 +202,10 @@ def make_scenario_table(
 def make_ablation_table(
     runs: Mapping[str, Run], robot: str, scenarios: Sequence[str], ablations: Mapping[str, Any]
 ) -> str:
-    """Table of variants, a row each, over all runs of `scenarios`; cells as in the others.
+    """Make a table of variants, a row each, of ``median / worst`` over all runs of `scenarios`.
 
-    A figure that a scenario does not have leaves that scenario out of its column. The ratio is
-    that of the first figure's medians.
+    A column omits scenarios that lack its metric. The column "× default" is the ratio of the
+    first metric's median to that of the default.
     """
     groups = {
         name: [
@@ -246,7 +246,7 @@ def make_ablation_table(
 
 
 def fill_document(text: str, blocks: Mapping[str, Callable[[], str] | str]) -> str:
-    """Put blocks between the markers ``<!-- begin NAME -->`` and ``<!-- end NAME -->``.
+    """Replace the text between the markers ``<!-- begin NAME -->`` and ``<!-- end NAME -->``.
 
     Raises:
         BadValue: If a block has no pair of markers in `text`.
@@ -263,7 +263,7 @@ def fill_document(text: str, blocks: Mapping[str, Callable[[], str] | str]) -> s
 
 
 def describe_run(key: str, run: Run) -> str:
-    """One line of a run's key figures."""
+    """Describe a run's key metrics in one line."""
     columns = get_columns(SCENARIOS[run["scenario"]])
     cells = []
     for heading, metric in {**columns, "falls": "falls", "solve [ms]": "solve_ms"}.items():

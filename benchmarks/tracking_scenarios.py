@@ -1,7 +1,7 @@
-"""Scenarios of the tracking benchmark: where the head shall be, and how well it must be there.
+"""Scenarios of the tracking benchmark: goals of the head over time, and their tolerances.
 
-All goals are laid out in the heading frame of the head at the start ("home"): X forward, Y left,
-Z up. A goal that steps is held from its start on; the time to arrive counts from the step.
+Goals are defined in the heading frame of the head at the start ("home"): X forward, Y left, Z up.
+A stepping goal is held from its start on; arrival times count from the step.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ from xop_lerobot.evaluation.bench import (
 WALK_SPEED = 0.5
 """Speed of the direct path that arrival times are compared with [m/s]."""
 ARRIVAL_S = 3.0
-"""Time that a mobile robot may take longer than the direct path [s]."""
+"""Time limit of a mobile robot's arrival beyond that of the direct path [s]."""
 STATIONARY_S = 1.5
-"""Time in which a stationary robot shall arrive [s]."""
+"""Time limit of a stationary robot's arrival [s]."""
 ROOM_HALF = 4.0
-"""Half the width of the scene `room`, between the walls' faces [m]."""
+"""Half the inner width of the scene `room` [m]."""
 ANYWHERE = 1.5
-"""Largest distance of the goals of `anywhere` [m]."""
+"""Maximum distance of the goals of `anywhere` from home [m]."""
 WALL_DISTANCE = 0.25
 """Distance of the room's goals from the nearest wall [m]."""
 ROOM_HOLD_S = 1.5
-"""How long each of the room's goals is held after it should have been reached [s]."""
+"""Time for which each of the room's goals is held after its time limit [s]."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What counts as being there.
+    """Errors up to which a goal counts as reached.
 
     Attributes:
-        position: Largest position error [m].
-        angle: Largest angle of the orientation error [rad].
+        position: Maximum position error [m].
+        angle: Maximum angle of the orientation error [rad].
     """
 
     position: float
@@ -59,13 +59,13 @@ class Tolerance:
 
 @dataclass(frozen=True)
 class GoalStep:
-    """One goal that is held.
+    """One held goal.
 
     Attributes:
-        start: When it becomes the goal, on the track's clock [s].
+        start: Start of the goal on the track's clock [s].
         head: Pose of the head in the world. Shape (7,).
-        direct_s: Time of the direct path to it [s].
-        limit_s: Time after `start` in which the robot shall be there [s].
+        direct_s: Duration of the direct path to it at `WALK_SPEED` [s].
+        limit_s: Time limit of the arrival after `start` [s].
     """
 
     start: float
@@ -76,16 +76,16 @@ class GoalStep:
 
 @dataclass(frozen=True)
 class GoalTrack:
-    """What the operator asks for over time.
+    """Goals of head and wrists over time.
 
     Attributes:
-        home: Pose of the head at the start. Shape (7,).
-        duration: Length [s].
-        steps: Goals that are held, in order of time; empty for a goal that moves.
-        path: The moving goal's pose at a time, None for goals that step.
-        reach: Place of the left wrist from the head, in the head's heading frame; the right one
-            mirrors it. None leaves the wrists where they are at home [m].
-        reach_start: When the wrists go there [s].
+        home: Pose of the head at the start, in the world. Shape (7,).
+        duration: Duration [s].
+        steps: Held goals in order of time; empty for a moving goal.
+        path: Pose of the moving goal as a function of time [s]; None for held goals.
+        reach: Position of the left wrist from the head, in the head's heading frame; the right
+            one mirrors it. None keeps the wrists as at home [m].
+        reach_start: Time from which `reach` applies, and from which a moving goal moves [s].
     """
 
     home: np.ndarray
@@ -96,7 +96,7 @@ class GoalTrack:
     reach_start: float = LEAD_IN_S
 
     def head_at(self, time: float) -> np.ndarray:
-        """Pose of the head's goal at `time` [s] of the track's clock. Shape (7,)."""
+        """Return the head's goal at `time` [s] of the track's clock, in the world. Shape (7,)."""
         if self.path is not None:
             return self.path(time)
         head = self.home
@@ -107,7 +107,7 @@ class GoalTrack:
 
 
 Builder = Callable[[np.ndarray, np.random.Generator, float, int], GoalTrack]
-"""Makes a track from home (7,), a generator, the time to hold [s] and the number of goals."""
+"""Makes a track from home (7,), a random generator, the hold time [s] and the number of goals."""
 
 
 @dataclass(frozen=True)
@@ -116,11 +116,11 @@ class Scenario:
 
     Attributes:
         name: Name on the command line.
-        title: What happens, for tables.
+        title: Title in tables.
         mode: Mode of the robot.
         build: Makes the track.
-        scene: Scene the robot stands in.
-        tolerances: What counts as being there, by robot; ``""`` for every other robot.
+        scene: Name of the scene.
+        tolerances: Tolerances by robot; ``""`` for every other robot.
     """
 
     name: str
@@ -131,7 +131,7 @@ class Scenario:
     tolerances: dict[str, Tolerance] = field(default_factory=dict)
 
     def get_tolerance(self, robot: str) -> Tolerance:
-        """What counts as being there for `robot`."""
+        """Return the tolerance for `robot`."""
         return self.tolerances.get(robot, self.tolerances[""])
 
 
@@ -143,7 +143,7 @@ MOBILE_TOLERANCE = {
 
 
 def _hold_each(home: np.ndarray, heads: tuple[np.ndarray, ...], hold: float) -> GoalTrack:
-    """Stationary goals one after the other, `hold` [s] in all, at least 3 s each."""
+    """Hold stationary goals one after the other, for `hold` [s] in all, at least 3 s each."""
     each = max(3.0, hold / len(heads))
     steps = tuple(
         GoalStep(LEAD_IN_S + i * each, head, 0.0, STATIONARY_S) for i, head in enumerate(heads)
@@ -152,7 +152,12 @@ def _hold_each(home: np.ndarray, heads: tuple[np.ndarray, ...], hold: float) -> 
 
 
 def _go(offset: tuple[float, float, float], yaw: float = 0) -> Builder:
-    """One mobile goal, held for `hold` [s] after it should have been reached."""
+    """Return a builder of one mobile goal, held for `hold` [s] after its time limit.
+
+    Args:
+        offset: Position of the goal from home, in home's heading frame [m].
+        yaw: Heading of the goal relative to home's [rad].
+    """
 
     def build(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
         del rng, num_goals
@@ -185,14 +190,14 @@ def _curve(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: i
 
 
 def _anywhere(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
-    """One random place within `ANYWHERE` of home, with a random heading."""
+    """Make a goal at a random place within `ANYWHERE` of home, with a random heading."""
     turn, far = rng.uniform(-math.pi, math.pi), ANYWHERE * math.sqrt(rng.uniform())
     offset = (far * math.cos(turn), far * math.sin(turn), 0.0)
     return _go(offset, rng.uniform(-math.pi, math.pi))(home, rng, hold, num_goals)
 
 
 def _room(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
-    """Random places at `WALL_DISTANCE` from a random wall, with a random heading."""
+    """Make goals at random places `WALL_DISTANCE` from a random wall, with random headings."""
     del hold
     steps, start, head = [], LEAD_IN_S, home
     for _ in range(num_goals):
@@ -210,7 +215,7 @@ def _room(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: in
 
 
 def _beyond(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
-    """One place that a robot on the spot can't reach: far off, low, and with a tilt."""
+    """Make a goal that a stationary robot can't reach: far away, low and tilted; then home."""
     del num_goals
     turn, far = rng.uniform(-math.pi, math.pi), rng.uniform(0.5, 1.0)
     bent = bend_from(home, yaw=rng.uniform(-2.5, 2.5), pitch=rng.uniform(-0.5, 0.8))
@@ -219,7 +224,7 @@ def _beyond(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: 
 
 
 def _arms(home: np.ndarray, rng: np.random.Generator, hold: float, num_goals: int) -> GoalTrack:
-    """Figure 2 of the paper: arms forward and high first, then squat and pitch, then back."""
+    """Make the motion of the paper's figure 2: arms forward and high, squat and pitch, back."""
     del num_goals
     reach = np.array([rng.uniform(0.35, 0.45), rng.uniform(0.1, 0.2), rng.uniform(-0.05, 0.1)])
     down, pitch = rng.uniform(0.15, 0.25), rng.uniform(0.3, 0.5)
@@ -287,4 +292,4 @@ SCENARIO_GROUPS: dict[str, tuple[str, ...]] = {
     "arms": ("arms",),
     "beyond": ("beyond",),
 }
-"""Scenarios that are told by the same figures, one table each."""
+"""Groups of scenarios with the same metrics, one table each."""

@@ -1,4 +1,4 @@
-"""What one run of the tracking benchmark is made of: robot, settings, ablation, seed."""
+"""Setup of one run of the tracking benchmark (robot, scenario, settings) and its ablations."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from xop_lerobot.retarget.presets import build_configs
 
 @dataclass(frozen=True)
 class Without:
-    """An override that takes one entry out of a list.
+    """An override that removes one entry from a tuple.
 
     Attributes:
-        entry: What is taken out.
+        entry: The removed entry.
     """
 
     entry: str
@@ -41,15 +41,15 @@ class Ablation:
     """One variant of the retargeter.
 
     Attributes:
-        title: What differs from the default, for tables.
+        title: Difference from the default, for tables.
         mpc: Overrides of `MpcConfig` by name, see `override_config`.
-        preset: Preset that the variant begins with, None for the one that was asked for.
+        preset: Preset that the variant starts from, None for the setup's.
         retargeter: Settings of `RetargeterConfig`.
-        noise: Preset of the sensors' noise, None for the one that was asked for.
-        equal_compute: Whether the number of samples is raised or lowered so that as many physics
-            steps per second are rolled out as without the ablation.
-        replaced: Parts without a setting, as ``"module:name"``, and what makes the replacement of
-            each out of it.
+        noise: Preset of the sensor noise, None for the setup's.
+        equal_compute: Whether to choose the number of samples so that as many physics steps per
+            second are rolled out as without the ablation.
+        replaced: Functions to replace, as ``"module:name"``, and a factory that makes each
+            replacement from the original. For parts that no setting switches off.
     """
 
     title: str
@@ -64,7 +64,7 @@ class Ablation:
 
     @contextmanager
     def replace(self) -> Iterator[None]:
-        """Put the replacements in place."""
+        """Apply the replacements while the context is open."""
         with ExitStack() as stack:
             for place, make in self.replaced.items():
                 owner, _, name = place.replace(":", ".").rpartition(".")
@@ -74,11 +74,12 @@ class Ablation:
 
 
 def _always(value: object) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make replacements that do nothing and return `value`."""
+    """Return a factory of replacements that only return `value`."""
     return lambda _stock: lambda *_args, **_kwargs: value
 
 
 def _without_learning(stock: Callable[..., Any]) -> Callable[..., Any]:
+    """Replace an observer's `update` by one that never learns."""
     return lambda *args, **kwargs: stock(*args, **{**kwargs, "learns": False})
 
 
@@ -166,28 +167,28 @@ ABLATIONS: dict[str, Ablation] = {
     ),
     "direct": Ablation("direct mapping", retargeter={"type": "direct"}),
 }
-"""Variants by name: each is the preset that was asked for, but for what is named."""
+"""Variants by name: the setup's preset with the given differences."""
 
 SYNC_VARIANTS = ("default", "no_sync", "exact", "exact_no_sync", "harsh", "harsh_no_sync")
-"""Variants that tell what the state synchronisation is good for."""
+"""Variants that show the effect of the state synchronisation."""
 
 
 @dataclass(frozen=True)
 class TrackingSetup:
-    """One run, but for its seed.
+    """Everything that determines a run, except its seed.
 
     Attributes:
         robot: Name of the robot.
         scenario: Name of the scenario.
         ablation: Name of the variant of the retargeter.
-        noise: Preset of the sensors' noise.
+        noise: Preset of the sensor noise.
         preset: Preset of the retargeter.
         sync: Whether the state is synchronised.
         low_level: Name of the low-level policy; empty for the robot's own.
         low_level_path: File of the low-level policy; empty for its default.
-        hold: How long goals are held [s].
+        hold: Time for which goals are held [s].
         goals: Number of goals of the scenario `room`.
-        payload: Mass that each hand carries, of which the planner knows nothing [kg].
+        payload: Mass in each hand, unknown to the planner [kg].
         fps: Rate of the control loop [Hz].
         overrides: Further settings of `MpcConfig`, see `override_config`.
     """
@@ -207,33 +208,34 @@ class TrackingSetup:
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
     def compute_key(self, seed: int) -> str:
-        """A name of the run with `seed` that changes with any of its resolved settings."""
+        """Compute the name of the run with `seed`; any resolved setting changes its digest."""
         configs = {mode.name: dataclasses.asdict(each) for mode, each in self.resolve().items()}
-        own = dataclasses.replace(self, low_level_path="")  # where it lies tells nothing
+        # The location of a policy's file does not change a run.
+        own = dataclasses.replace(self, low_level_path="")
         settings = [dataclasses.asdict(own), configs]
         text = json.dumps(settings, sort_keys=True, default=str)
         digest = hashlib.sha256(text.encode()).hexdigest()[:8]
         return f"{self.robot}/{self.scenario}/{self.ablation}/{seed}/{digest}"
 
     def resolve(self) -> dict[Mode, MpcConfig]:
-        """Parameters of both modes; see `resolve_configs`."""
+        """Resolve the planner's parameters of both modes; see `resolve_configs`."""
         return resolve_configs(self)
 
     @property
     def is_standard(self) -> bool:
-        """Whether the run belongs into the documents: nothing was set but by the ablation."""
+        """Whether only the ablation, hold and goals differ from the defaults, as in documents."""
         standard = TrackingSetup(self.robot, self.scenario, self.ablation)
         free = {name: getattr(standard, name) for name in ("hold", "goals")}
         return dataclasses.replace(self, **free) == standard
 
     @property
     def resolved_noise(self) -> str:
-        """The noise preset that the run has."""
+        """The noise preset of the run: the ablation's, else the setup's."""
         return get_ablation(self.ablation).noise or self.noise
 
 
 def get_ablation(name: str) -> Ablation:
-    """Look the ablation `name` up.
+    """Return the ablation `name`.
 
     Raises:
         UnknownName: Listing the known ones.
@@ -244,7 +246,7 @@ def get_ablation(name: str) -> Ablation:
 
 
 def override_config(config: MpcConfig, overrides: Mapping[str, Any], mode: Mode) -> MpcConfig:
-    """Return `config` with some of its values replaced.
+    """Return a copy of `config` with some values replaced.
 
     Args:
         config: The robot's own parameters in `mode`.
@@ -255,6 +257,7 @@ def override_config(config: MpcConfig, overrides: Mapping[str, Any], mode: Mode)
 
     Raises:
         UnknownName: If there is no such field or entry, listing the known ones.
+        BadValue: If a field without entries is given one.
     """
     prefixes = {each.name.lower(): each for each in Mode}
     for name, value in overrides.items():
@@ -273,7 +276,7 @@ def override_config(config: MpcConfig, overrides: Mapping[str, Any], mode: Mode)
 
 
 def _override_entry(field_name: str, current: Any, entry: str, value: Any) -> Any:
-    """The value of a field with one of its entries, or all of it, replaced."""
+    """Return the value of a field with one of its entries, or all of it, replaced."""
     if isinstance(value, Without):
         return tuple(each for each in current if each != value.entry)
     if not entry:
@@ -289,7 +292,7 @@ def _override_entry(field_name: str, current: Any, entry: str, value: Any) -> An
 
 
 def resolve_configs(setup: TrackingSetup) -> dict[Mode, MpcConfig]:
-    """Parameters of both modes: the preset's, then the setup's overrides, then the ablation's.
+    """Resolve the parameters of both modes: preset, then setup's overrides, then ablation's.
 
     Raises:
         UnknownName: If a name in `setup` is unknown.
@@ -313,24 +316,24 @@ def _resolve(setup: TrackingSetup, preset: str, last: Mapping[str, Any]) -> dict
 
 
 def make_tuned_morphology(setup: TrackingSetup) -> Morphology:
-    """Make the robot, with the parameters that `setup` asks for as its own.
+    """Make the robot, with the parameters of `setup` as its own.
 
     Raises:
         UnknownName: If a name in it is unknown.
     """
     morphology = make_morphology(setup.robot)
-    # Only this one robot has other parameters, not its class.
+    # Set on the instance, so that other robots of the class keep their parameters.
     vars(morphology)["mpc_config"] = resolve_configs(setup).__getitem__
     return morphology
 
 
 def make_retargeter_config(setup: TrackingSetup, seed: int) -> RetargeterConfig:
-    """Settings of the retargeter: one thread, and its ablation.
+    """Make the settings of the retargeter: one thread, and those of the ablation.
 
-    The preset is the default one: that of the setup is in the robot's own parameters already.
+    The preset stays the default: `make_tuned_morphology` has already applied the setup's.
 
     Raises:
-        UnknownName: If the ablation sets what the retargeter does not have.
+        UnknownName: If the ablation sets a field that the retargeter does not have.
     """
     settings: dict[str, Any] = {"threads": 1, "seed": seed, "sync": setup.sync}
     settings |= dict(get_ablation(setup.ablation).retargeter)
@@ -342,20 +345,20 @@ def make_retargeter_config(setup: TrackingSetup, seed: int) -> RetargeterConfig:
 
 
 def compute_policy_steps(config: MpcConfig) -> float:
-    """Low-level control steps that are rolled out per second of the robot's clock [1/s]."""
+    """Compute the low-level control steps rolled out per second of the robot's clock [1/s]."""
     return config.num_samples * config.horizon * config.control_hz
 
 
 def compute_physics_steps(config: MpcConfig, time_step: float) -> float:
-    """Physics steps that are rolled out per second of the robot's clock [1/s]."""
+    """Compute the physics steps rolled out per second of the robot's clock [1/s]."""
     return compute_policy_steps(config) * round(POLICY_DT / time_step)
 
 
 def parse_overrides(settings: Sequence[str]) -> dict[str, Any]:
-    """Read settings ``name=value``, the value as YAML reads it.
+    """Parse settings ``name=value``, the values as YAML.
 
     Raises:
-        BadValue: If one is no such pair.
+        BadValue: If a setting is malformed.
     """
     pairs = (split_pair(setting, "a setting reads name=value") for setting in settings)
     return {name: load_yaml(value, switches=True) for name, value in pairs}
