@@ -1,1 +1,1 @@
-"""Programs of the project by itself; not installed."""
+"""Development scripts: set-up, demo, training of G1's policy; not part of the installed package."""

@@ -1,10 +1,10 @@
-"""Record and show one scripted episode of each robot, with stock LeRobot: what `make demo` runs.
+"""Record and show one scripted episode of each robot with stock LeRobot; run by `make demo`.
 
     make demo
     .venv/bin/python scripts/demo.py --robots g1 --out outputs/demo
 
-For each robot: `lerobot-record` writes a dataset, `LeRobotDataset` loads it back, and a table, a
-picture strip, a film and a small moving picture show what happened.
+For each robot, `lerobot-record` writes a dataset, `LeRobotDataset` loads it back, and the episode
+is shown as a table, a strip of images, a video and a GIF.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ ROOT = Path(__file__).resolve().parent.parent
 FPS = 25
 CAMERAS = ("head", "scene")
 TAIL_LINES = 30
+"""Lines of a failed recording's output in the error message."""
 
 
 @dataclass(frozen=True)
 class Demo:
-    """One recorded show.
+    """One demo episode.
 
     Attributes:
-        robot: Short name of the robot, which is also its dataset's folder.
+        robot: Name of the robot, also that of its dataset's folder.
         script: Built-in script of the operator.
-        task: What the operator does, as the dataset says it.
-        episode_s: Length of the episode: settling, the script, and a rest at its end [s].
+        task: Task description in the dataset.
+        episode_s: Duration: settling, the script, and a rest at its end [s].
     """
 
     robot: str
@@ -52,11 +53,11 @@ DEMOS = {
 
 
 class DemoError(XopError):
-    """A recording failed; the message carries the command and the end of its output."""
+    """A recording failed; the message contains its exit status and the end of its output."""
 
 
 def build_command(demo: Demo, root: Path) -> list[str]:
-    """Build the `lerobot-record` command of `demo`, as a person would type it."""
+    """Build the `lerobot-record` command of `demo`, writing the dataset to `root`."""
     return [
         "lerobot-record",
         f"--robot.type=xop_{demo.robot}",
@@ -71,7 +72,7 @@ def build_command(demo: Demo, root: Path) -> list[str]:
         f"--dataset.episode_time_s={demo.episode_s:g}",
         "--dataset.reset_time_s=0",
         f"--dataset.fps={FPS}",
-        # The one video setting that keeps real time on two cores.
+        # The only encoder settings that keep real time on two cores.
         "--dataset.streaming_encoding=true",
         "--dataset.rgb_encoder.vcodec=h264",
         "--dataset.rgb_encoder.preset=ultrafast",
@@ -83,7 +84,10 @@ def build_command(demo: Demo, root: Path) -> list[str]:
 
 
 def build_environment(out: Path, environment: Mapping[str, str]) -> dict[str, str]:
-    """Build the environment of a recording: no display, no network, nothing in the home folder."""
+    """Build a recording's environment: no display, no network, no files in the home folder.
+
+    Variables of `environment` take precedence.
+    """
     return {
         "MUJOCO_GL": "egl",
         "HF_HUB_OFFLINE": "1",
@@ -95,7 +99,7 @@ def build_environment(out: Path, environment: Mapping[str, str]) -> dict[str, st
 
 
 def move_aside(root: Path) -> Path | None:
-    """Move an older dataset at `root` to the first free numbered name, and return that."""
+    """Rename an existing dataset at `root` to the first free `root.N`; returns the new path."""
     if not root.exists():
         return None
     number = 1
@@ -109,14 +113,14 @@ def record(demo: Demo, out: Path) -> tuple[Path, float]:
     """Record `demo` below `out`.
 
     Returns:
-        The dataset's folder, and how long it took [s].
+        The dataset's folder, and the time it took [s].
 
     Raises:
-        DemoError: If `lerobot-record` fails; carries the end of its output.
+        DemoError: If `lerobot-record` fails.
     """
     root = out / demo.robot
     if aside := move_aside(root):
-        print(f"  the older recording is now {_shorten(aside)}")
+        print(f"  the previous recording is now {_shorten(aside)}")
     command = build_command(demo, root)
     print(f"  {shlex.join(command)}", flush=True)
     executable = Path(sys.executable).with_name(command[0])
@@ -142,8 +146,8 @@ def record(demo: Demo, out: Path) -> tuple[Path, float]:
 
 
 def show(demos: list[Demo], roots: list[Path], out: Path) -> None:
-    """Load the datasets back, write the pictures and print the table."""
-    # Loading LeRobot takes seconds, so it waits until the recordings are there.
+    """Load the datasets back, write images and videos, and print the table."""
+    # Importing LeRobot takes seconds and reads the environment, so it waits for the recordings.
     os.environ.update(build_environment(out, os.environ))
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -169,23 +173,26 @@ def show(demos: list[Demo], roots: list[Path], out: Path) -> None:
         films.write_video(base.with_suffix(".mp4"), films.build_film(cameras, FPS), FPS)
         films.write_gif(base.with_suffix(".gif"), films.build_film(cameras, FPS), FPS)
         print(f"{demo.robot}: dataset {_shorten(root)}", end="")
-        print(f", pictures {_shorten(base)}.png, .mp4 and .gif")
+        print(f", images and video {_shorten(base)}.png, .gif and .mp4")
     print(f"\n{summary.format_summaries(summaries)}")
 
 
 def _shorten(path: Path) -> str:
-    """Return `path` relative to the working directory where it is below it."""
+    """Return `path` relative to the working directory if it is below it."""
     return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Record and show what `arguments` ask for; return the exit status."""
+    """Record and show the requested episodes; returns the exit status."""
     parser = argparse.ArgumentParser(description="Record and show one episode of each robot.")
     parser.add_argument(
         "--robots", default=",".join(DEMOS), help="robots, separated by commas (default: all)"
     )
     parser.add_argument(
-        "--out", type=Path, default=ROOT / "outputs" / "demo", help="where datasets and films go"
+        "--out",
+        type=Path,
+        default=ROOT / "outputs" / "demo",
+        help="directory for datasets and videos",
     )
     options = parser.parse_args(arguments)
     try:

@@ -1,12 +1,13 @@
-r"""Distil FALCON's G1 policy into the student that ships with the package.
+r"""Train the G1 policy that ships with the package, by distillation.
 
     python -m scripts.distill_low_level --teacher g1_29dof.onnx --seed 0 \
         --out xop_lerobot/low_level/weights/g1_student.npz
 
-DAgger (Ross et al., 2011): many robots run in the planning model; each is driven by the teacher
-or by the student, the teacher's share falls from one to zero, and the student is trained on
-what the teacher would have done in every state that was met. The teacher (`low_level_teacher.py`)
-is FALCON where the robot steps, and a balance that knows the true state where it stands.
+DAgger (Ross et al., 2011): many robots run in the planning model, each driven by the teacher or by
+the student. The teacher's share falls from one to zero, and the student is trained on the
+teacher's action in every visited state. The teacher (`low_level_teacher.py`) is FALCON where the
+robot steps, and a balance controller with the true state where it stands.
+docs/how_it_works/low_level.md describes the runs of the shipped weights.
 """
 
 from __future__ import annotations
@@ -55,51 +56,56 @@ WIDE = ExcitationConfig(
     push_period=4.0,
     hand_force=22.0,
 )
-"""Ranges of most training robots: wider than what a robot is asked for."""
+"""Ranges of most training robots, wider than the command space."""
 
 LOW = replace(WIDE, height=(0.40, 0.62), push=0.3)
-"""Ranges of robots that stand low."""
+"""Ranges of robots that stand low, with weaker pushes."""
 
 USUAL = ExcitationConfig(
     height=(0.42, 0.78), waist_roll=0.2, waist_pitch=(-0.2, 0.6), push_period=4.0
 )
-"""About the ranges of the comparison."""
+"""Ranges similar to those of the comparison of policies."""
 
 STANDING, MOVING = (LOW, WIDE), (WIDE, USUAL)
-"""Ranges of the quarters of the robots that stand all the time, and that sometimes walk."""
+"""Ranges of four quarters of the robots: two that always stand, and two that sometimes walk."""
 
 SWAY = (0.15, 0.1)
-"""Largest velocities, forward and left, by which a standing robot is told to sway [m/s]."""
+"""Maximum velocity commands, forward and left, for weight shifts of standing robots [m/s]."""
 
 PAYLOAD, PAYLOAD_SHARE = 2.5, 0.4
-"""Largest mass in a hand [kg], and share of the robots that carry something."""
+"""Maximum mass in each hand [kg], and fraction of the robots that carry a payload."""
 
 FORCE_LAG_S = 0.2
-"""Time in which forces on the hands grow [s]."""
+"""Time constant of the forces on the hands [s]."""
 
 EPISODE_STEPS = 1000
 BLOCK_STEPS = 50
-"""Steps for which one of teacher and student drives a robot before it is drawn again."""
+"""Policy steps after which the driver of each robot, teacher or student, is drawn again."""
 
 REFINE_AFTER = 3
-"""Rounds of experience before an earlier student is trained further."""
+"""Rounds of experience to collect before training of an earlier student is resumed."""
 
 NUM_JOINTS = len(JOINTS.names)
 
 OUTPUT_WEIGHTS = np.ones(NUM_JOINTS)
-OUTPUT_WEIGHTS[13:15] = 0.1  # waist roll and pitch: only seen as a last action
-OUTPUT_WEIGHTS[ARMS] = 0.3  # arms: a small residual
+"""Weights of the joints in the loss."""
+OUTPUT_WEIGHTS[13:15] = 0.1  # waist roll and pitch follow the command; only the memory uses these
+OUTPUT_WEIGHTS[ARMS] = 0.3  # only a small offset is added to the arm targets
 
 
 LIFT = 16.0
-"""Offset at which ELU is the identity for what the skip gives, which is within 3."""
+"""Bias that keeps the skip's outputs, which are within ±3, positive, where ELU is the identity."""
 
 
 class Network(LoadedNetwork):
-    """The student while it is trained: standardised inputs, ELU between the layers, and a skip.
+    """The student during training: a multilayer perceptron with standardised inputs and a skip.
 
-    Much of what the teacher does is linear: targets are the angles of now plus torques over
-    stiffness. A linear path beside the layers learns that at once.
+    Much of the teacher is linear: a target is the present angle plus torque over stiffness. A
+    linear path in parallel to the ELU layers learns that quickly.
+
+    Args:
+        hidden: Widths of the hidden layers.
+        observations: Observations that define the standardisation. Shape (n, 575).
     """
 
     def __init__(self, hidden: tuple[int, ...], observations: torch.Tensor) -> None:
@@ -117,16 +123,16 @@ class Network(LoadedNetwork):
         nn.init.zeros_(self.skip.bias)
 
     def parameters(self) -> list[nn.Parameter]:
-        """All that is trained."""
+        """Return the trained parameters."""
         return [*self.body.parameters(), *self.skip.parameters()]
 
     def compute(self, observation: torch.Tensor) -> torch.Tensor:
-        """Actions for observations. Shapes (n, 575) -> (n, 29)."""
+        """Compute the actions for observations. Shapes (n, 575) -> (n, 29)."""
         inputs = self.standardise(observation)
         return self.body(inputs) + self.skip(inputs)
 
     def standardise(self, observation: torch.Tensor) -> torch.Tensor:
-        """Shift and scale observations to about zero mean and unit spread."""
+        """Shift and scale observations to about zero mean and unit standard deviation."""
         return (observation - self.mean) / self.spread
 
     def __call__(
@@ -138,7 +144,7 @@ class Network(LoadedNetwork):
             return self.compute(torch.from_numpy(observation)).numpy(), hidden
 
     def load(self, weights: list[np.ndarray], biases: list[np.ndarray]) -> None:
-        """Take the layers of a saved student; the inverse of `layers`."""
+        """Load the layers of a saved student; the inverse of `layers`."""
         mean, spread = self.mean.double().numpy(), self.spread.double().numpy()
         linear = [module for module in self.body if isinstance(module, nn.Linear)]
         first, offset = weights[0].astype(float) * spread[:, None], biases[0] + mean @ weights[0]
@@ -154,10 +160,10 @@ class Network(LoadedNetwork):
                 layer.bias.copy_(torch.from_numpy(bias[:outputs]))
 
     def layers(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return matrices (inputs, outputs) and offsets, standardisation and skip folded in.
+        """Return matrices (inputs, outputs) and biases with standardisation and skip folded in.
 
-        The skip becomes 29 units more in each hidden layer, lifted so far that ELU leaves them as
-        they are; so the network that runs is a plain multilayer perceptron.
+        The skip becomes 29 more units in each hidden layer, offset by `LIFT` so that ELU passes
+        them unchanged; so the deployed network is a plain multilayer perceptron.
         """
         linear = [module for module in self.body if isinstance(module, nn.Linear)]
         weights = [layer.weight.detach().double().T.numpy() for layer in linear]
@@ -182,7 +188,12 @@ class Network(LoadedNetwork):
 
 
 class Experience:
-    """All observations met so far and the teacher's action in each, in half precision."""
+    """All observations so far and the teacher's action in each, in half precision.
+
+    Args:
+        capacity: Maximum number of samples.
+        width: Entries of an observation.
+    """
 
     def __init__(self, capacity: int, width: int) -> None:
         self.observations = torch.empty((capacity, width), dtype=torch.float16)
@@ -190,20 +201,27 @@ class Experience:
         self.size = 0
 
     def add(self, observations: np.ndarray, actions: np.ndarray) -> None:
-        """Append a batch."""
+        """Append a batch. Shapes (n, width), (n, 29)."""
         rows = slice(self.size, self.size + len(observations))
         self.observations[rows] = torch.from_numpy(observations)
         self.actions[rows] = torch.from_numpy(actions)
         self.size += len(observations)
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw a random batch, float32."""
+        """Draw a random batch of observations and actions, float32."""
         rows = torch.randint(0, self.size, (count,), generator=generator)
         return self.observations[rows].float(), self.actions[rows].float()
 
 
 class Collector:
-    """Robots that run without end, driven by a mixture of teacher and student."""
+    """Endlessly simulated robots that teacher and student drive by turns.
+
+    Args:
+        teacher: The teacher.
+        robots: Number of robots.
+        threads: Threads of the simulation.
+        rng: Random generator of models, commands, noise and drivers.
+    """
 
     def __init__(
         self, teacher: Teacher, robots: int, threads: int, rng: np.random.Generator
@@ -211,14 +229,15 @@ class Collector:
         self.teacher, self.rng, self.robots = teacher, rng, robots
         morphology = make_morphology("g1")
         models = [randomise(build_model(morphology, "planning"), rng) for _ in range(robots)]
-        self.weight = np.zeros((robots, 2, 3))  # of what hands carry, which the teacher knows [N]
+        # Weights of the payloads, which the teacher knows, as forces on the hands [N].
+        self.weight = np.zeros((robots, 2, 3))
         for model, weight in zip(models, self.weight, strict=True):
             weight[:, 2] = -GRAVITY * load_hands(model, rng)
         self.simulation = BatchSimulation(models, morphology.standing_qpos(), threads)
-        self.student = load_policy("default")  # its table says what is remembered and seen
+        self.student = load_policy("default")  # its table defines observation and memory
         self.memory = self.student.initial_memory(robots)
         self.taught_memory, self.share = teacher.initial_memory(robots), np.zeros(robots)
-        # Arms that push against something, or each other, are not where they are told to be.
+        # Arms in contact, with an object or with each other, miss their targets.
         self.hindered = rng.uniform(size=(robots, 1)) < 0.15
         self.noise = rng.uniform(0, 1, (robots, 1)) * (rng.uniform(size=(robots, 1)) < 0.6)
         self.excitation: Excitation | None = None
@@ -228,7 +247,14 @@ class Collector:
     def collect(
         self, student: LowLevelPolicy | None, share: float, steps: int, experience: Experience
     ) -> None:
-        """Run `steps` steps with the teacher's `share` and add them to `experience`."""
+        """Run `steps` policy steps and add their observations and actions to `experience`.
+
+        Args:
+            student: Policy that drives besides the teacher; None for the shipped one.
+            share: Probability that the teacher drives a robot in a block of `BLOCK_STEPS`.
+            steps: Number of policy steps.
+            experience: Receives the samples of all robots, whoever drives.
+        """
         simulation = self.simulation
         teaches = np.ones(self.robots, bool)
         for step in range(steps):
@@ -251,9 +277,10 @@ class Collector:
             own, self.memory = (student or self.student).act(*inputs)
             targets = np.where(teaches[:, None], taught.targets, own)
             self.taught_memory, self.share = taught.memory, taught.share
-            # Both remember what was done, whoever did it.
+            # Both memories contain the executed action, whoever drove.
             self.memory[teaches, ACTIONS] = taught.actions[teaches]
             self.taught_memory[:, ACTIONS] = self.memory[:, ACTIONS]
+            # Hindered arms go to the targets of another robot instead of their own.
             elsewhere = np.roll(arms, 1, axis=0) - arms
             targets[:, ARMS] += np.where(self.hindered, elsewhere, 0.0)
             simulation.step(targets, force)
@@ -266,7 +293,7 @@ class Collector:
             self.step += 1
 
     def _sense(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and velocities with some noise."""
+        """Return positions and velocities with sensor noise, scaled per robot by `noise`."""
         qpos, qvel = self.simulation.qpos.copy(), self.simulation.qvel.copy()
         normal = self.rng.standard_normal
         qpos[:, 7:] += 0.005 * self.noise * normal((self.robots, qpos.shape[1] - 7))
@@ -278,7 +305,12 @@ class Collector:
 
 
 def make_training_excitation(rng: np.random.Generator, robots: int) -> Excitation:
-    """Draw one episode: a quarter of the robots in each of the ranges, half of them standing."""
+    """Draw one episode: a quarter of the robots in each of the ranges, half of them standing.
+
+    Args:
+        rng: Random generator.
+        robots: Number of robots.
+    """
     configs = (*STANDING, *MOVING)
     sizes = np.diff(np.arange(len(configs) + 1) * robots // len(configs))
     standing = sizes[: len(STANDING)].sum()
@@ -292,12 +324,13 @@ def make_training_excitation(rng: np.random.Generator, robots: int) -> Excitatio
     )
     drawn.mode[:, :standing] = Mode.STATIONARY
     force = drawn.hand_force
-    force[:, ::2, 1] = force[:, ::2, 0]  # half carry with both hands
-    for step in range(1, EPISODE_STEPS):  # forces that jump can't be leant against
+    force[:, ::2, 1] = force[:, ::2, 0]  # half the robots carry with both hands
+    # A first-order lag: no robot can lean against forces that jump.
+    for step in range(1, EPISODE_STEPS):
         force[step] = force[step - 1] + (force[step] - force[step - 1]) * (POLICY_DT / FORCE_LAG_S)
     stands = drawn.mode == Mode.STATIONARY
     drawn.command[:, :standing, VELOCITIES] = 0.0
-    # A standing robot is told small velocities that change slowly, by which it sways.
+    # In stance, 40 % of the robots get small, slowly changing velocity commands: weight shifts.
     phase = rng.uniform(0, 2 * np.pi, (2, robots)) + np.arange(EPISODE_STEPS)[:, None, None] * (
         POLICY_DT * rng.uniform(0.2, 1.5, (2, robots))
     )
@@ -309,10 +342,14 @@ def make_training_excitation(rng: np.random.Generator, robots: int) -> Excitatio
 
 
 def load_hands(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
-    """Put something into the hands of some robots, into both the same or into each its own.
+    """Add random payloads to the hands of some robots, equal in half of the cases.
+
+    Args:
+        model: Model, changed in place.
+        rng: Random generator.
 
     Returns:
-        Masses in the left and the right hand [kg]. Shape (2,).
+        Masses added to the left and the right hand [kg]. Shape (2,).
     """
     carries, alike = rng.uniform(size=2) < (PAYLOAD_SHARE, 0.5)
     masses = carries * rng.uniform(0, PAYLOAD, 2)
@@ -327,7 +364,10 @@ def load_hands(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
 
 
 def randomise(model: mujoco.MjModel, rng: np.random.Generator) -> mujoco.MjModel:
-    """Vary friction, masses and gains of a model in place; a quarter have dry friction."""
+    """Randomise friction, masses and gains of a model in place; returns it.
+
+    A quarter of the models have dry friction in their joints.
+    """
     model.dof_frictionloss[6:] = 0.2 if rng.uniform() < 0.25 else 0.0
     model.geom_friction[:, 0] = rng.uniform(0.5, 1.2)
     scale = rng.uniform(0.95, 1.05, (model.nbody, 1))
@@ -347,7 +387,19 @@ def train(
     batch: int,
     generator: torch.Generator,
 ) -> float:
-    """Fit the network; the learning rate falls from `rates[0]` to `rates[1]`. Returns the loss."""
+    """Train the network by Adam with a smooth L1 loss.
+
+    Args:
+        network: The network.
+        experience: Samples.
+        updates: Number of gradient steps.
+        rates: Learning rates at the start and the end, exponentially decayed.
+        batch: Samples per gradient step.
+        generator: Random generator of the batches.
+
+    Returns:
+        Mean loss.
+    """
     spread = experience.actions[: experience.size : 50].float().std(0).clamp(min=0.05)
     scale = torch.from_numpy(OUTPUT_WEIGHTS).float().sqrt() / spread
     optimizer = torch.optim.Adam(network.parameters(), lr=rates[0])
@@ -367,7 +419,11 @@ def train(
 
 
 def distill(arguments: argparse.Namespace) -> Network:
-    """Run DAgger and return the trained network."""
+    """Run DAgger and return the trained network.
+
+    Raises:
+        BadValue: If there are too few rounds to train at all.
+    """
     rng = np.random.default_rng(arguments.seed)
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(arguments.threads)
@@ -385,7 +441,7 @@ def distill(arguments: argparse.Namespace) -> Network:
         collector.falls = 0
         collector.collect(driver, share, steps, experience)
         if refines and turn < REFINE_AFTER:
-            continue  # too little experience yet: training would forget more than it learns
+            continue  # on so few samples, training would forget more than it learns
         if network is None:
             network = Network(
                 tuple(arguments.hidden), experience.observations[: experience.size].float()
@@ -395,7 +451,7 @@ def distill(arguments: argparse.Namespace) -> Network:
             driver = load_policy("default", network=network)
         rates = (3e-4, 1e-4) if refines else (1e-3, 3e-4)
         loss = train(network, experience, arguments.updates, rates, arguments.batch, generator)
-        save_weights(arguments.out, *network.layers())  # a long run leaves something if cut off
+        save_weights(arguments.out, *network.layers())  # so that an aborted run leaves a result
         logger.info(
             "round %d/%d: teacher share %.2f, falls %d, loss %.5f, %d samples, %.0f s",
             turn + 1, arguments.rounds, share, collector.falls, loss,
@@ -414,28 +470,32 @@ def distill(arguments: argparse.Namespace) -> Network:
 
 
 def parse_arguments() -> argparse.Namespace:
-    """Read the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         description="Distil FALCON's G1 policy into a smaller network.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--teacher", help="FALCON's ONNX file; None: cached or downloaded")
-    parser.add_argument("--seed", type=int, default=0, help="seed of training")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
     parser.add_argument("--out", type=Path, required=True, help="weights of the student, .npz")
-    parser.add_argument("--hidden", type=int, nargs="+", default=[512, 256], help="layer widths")
-    parser.add_argument("--init", type=Path, help="weights of a student to train further, .npz")
+    parser.add_argument(
+        "--hidden", type=int, nargs="+", default=[512, 256], help="widths of the hidden layers"
+    )
+    parser.add_argument("--init", type=Path, help="weights of a student to resume from, .npz")
     parser.add_argument("--rounds", type=int, default=24, help="rounds of DAgger")
-    parser.add_argument("--robots", type=int, default=256, help="robots at once")
-    parser.add_argument("--steps", type=int, default=150, help="policy steps a round [20 ms]")
-    parser.add_argument("--updates", type=int, default=300, help="gradient steps a round")
-    parser.add_argument("--final-updates", type=int, default=8000, help="gradient steps at last")
-    parser.add_argument("--batch", type=int, default=1024, help="samples a gradient step")
+    parser.add_argument("--robots", type=int, default=256, help="robots simulated in parallel")
+    parser.add_argument("--steps", type=int, default=150, help="policy steps per round [20 ms]")
+    parser.add_argument("--updates", type=int, default=300, help="gradient steps per round")
+    parser.add_argument(
+        "--final-updates", type=int, default=8000, help="gradient steps after the last round"
+    )
+    parser.add_argument("--batch", type=int, default=1024, help="samples per gradient step")
     parser.add_argument("--threads", type=int, default=2, help="threads")
     return parser.parse_args()
 
 
 def main() -> None:
-    """Train and save."""
+    """Train the student and save its weights."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     arguments = parse_arguments()
     start = time.monotonic()

@@ -1,9 +1,9 @@
-"""Draw the operator's frames, and those in which headsets deliver them: docs/images/frames.png.
+"""Draw the frames of operator and headsets: makes docs/images/frames.png.
 
     python scripts/draw_frames.py --out frames.png
 
-A person stands with the palms down and the fingers forward. Every axis is drawn from the matrices
-by which the devices convert, so the picture cannot say anything else than the code.
+The person stands with palms down and fingers forward. All axes come from the matrices with which
+the devices convert poses, so that the image cannot contradict the code.
 """
 
 from __future__ import annotations
@@ -23,20 +23,23 @@ from xop_lerobot.operator.axes import WORLD
 from xop_lerobot.operator.devices.avp import AXES
 from xop_lerobot.operator.webxr.protocol import GRIPS, PARALLEL
 
-PLACES = {
+PLACES = {  # positions of the frames in the operator's world [m]
     "head": np.array([0.0, 0.0, 0.6]),
     "left_wrist": np.array([0.4, 0.5, 0.0]),
     "right_wrist": np.array([0.4, -0.5, 0.0]),
 }
 COLOURS = ("#d62728", "#2ca02c", "#1f77b4")
-LENGTH = 0.26
-FINGERS = 0.2
+LENGTH = 0.26  # of a drawn axis [m]
+FINGERS = 0.2  # length of a hand [m]
 
 
 def make_panels() -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """World and frames of each panel: columns are axes, in the operator's world. Shapes (3, 3)."""
+    """Return world and frames of each panel by title.
+
+    Columns of the matrices are axes in the operator's world. Shapes (3, 3).
+    """
     ours = dict.fromkeys(PLACES, np.eye(3))
-    # Columns of the devices' matrices are our axes in theirs; here it is theirs in ours.
+    # Columns of the devices' matrices are our axes in their frames; the transposes are drawn.
     avp = {name: axes.T for name, axes in AXES.items()}
     webxr = dict.fromkeys(PLACES, PARALLEL.T)
     grips = {"head": PARALLEL.T} | {f"{side}_wrist": axes.T for side, axes in GRIPS.items()}
@@ -49,14 +52,14 @@ def make_panels() -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
 
 
 def draw_axes(ax: Any, origin: np.ndarray, axes: np.ndarray, names: str) -> None:
-    """Draw three axes as arrows."""
+    """Draw the columns of `axes` (3, 3) as labelled arrows from `origin` (3,)."""
     for column, colour, name in zip(axes.T, COLOURS, names, strict=True):
         ax.quiver(*origin, *(LENGTH * column), color=colour, arrow_length_ratio=0.22, lw=2)
         ax.text(*(origin + 1.2 * LENGTH * column), name, color=colour, ha="center", va="center")
 
 
 def draw_person(ax: Any) -> None:
-    """Draw a head that looks along X, and hands with the palms down."""
+    """Draw a head facing along X, and hands with palms down."""
     u, v = np.mgrid[0 : 2 * np.pi : 16j, 0 : np.pi : 9j]
     head = 0.09 * np.array([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), 1.25 * np.cos(v)])
     ax.plot_surface(*(head + PLACES["head"][:, None, None]), color="#bbbbbb", alpha=0.5)
@@ -70,7 +73,7 @@ def draw_person(ax: Any) -> None:
 
 
 def main() -> None:
-    """Draw all panels."""
+    """Draw all panels and write the image."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="PNG file to write")
     out = parser.parse_args().out

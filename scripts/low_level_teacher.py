@@ -1,11 +1,11 @@
-r"""The teacher of G1's student: FALCON where the robot steps, a balance of our own where it stands.
+r"""The teacher of G1's student: FALCON where the robot steps, a balance controller where it stands.
 
-FALCON loses its footing below 0.55 m, does not lean, and minds the arms. Standing on two planted
-feet needs no learning: where the true state and the model are known, as a teacher in simulation
-may know them, the wrench that the feet must bear follows from a few springs, and the legs'
-torques from their Jacobians. `Balance` computes them; `Teacher` lets it act as long as the robot
-can be caught without a step, and FALCON, with calm arms, otherwise. Both are (nearly) functions
-of the present state, so that a network that sees five frames can imitate them.
+FALCON loses its footing below 0.55 m, does not lean, and is disturbed by the arms. Standing on two
+planted feet needs no learning: with the true state and the model, which a teacher in simulation may
+use, the required contact wrench follows from springs and dampers, and the legs' torques from their
+Jacobians. `Balance` computes them. `Teacher` uses it while the robot can recover without a step,
+and FALCON with calm arms otherwise. Both are (nearly) functions of the present state, so that a
+network that sees five frames can imitate them. Lengths are in m, angles in rad, times in s.
 """
 
 from __future__ import annotations
@@ -27,46 +27,47 @@ from xop_lerobot.morphology.scene import build_model
 JOINTS = read_joints("g1")
 ARMS = slice(JOINTS.arms[0], JOINTS.arms[-1] + 1)
 ACTIONS = slice(0, len(JOINTS.names))
-"""Last outputs in the memory of student and FALCON."""
+"""Entries of the last action in the memories of student and FALCON."""
 ACTION_SCALE = 0.25
-"""Of both tables."""
+"""Joint angle per unit of action in both policies' tables [rad]."""
 LEGS, WAIST = slice(0, 12), slice(12, 15)
 LEG = 6
-"""Joints of a leg."""
+"""Number of joints of a leg."""
 COMMANDED_WAIST, PITCH, VELOCITIES = slice(1, 4), 3, slice(4, 7)
 """Entries of the command."""
 LEAN_FROM, MAX_LEAN = 0.5, 0.5
-"""A pitch beyond the first is for the pelvis, up to the second [rad]."""
+"""Commanded pitch above which the pelvis leans too, and its maximum lean [rad]."""
 
 GRAVITY = 9.81
 SOLE = np.array([0.035, 0.0, -0.035])
-"""Middle of the sole in the ankle roll link [m]."""
+"""Centre of the sole in the frame of the ankle roll link [m]."""
 HALF_LENGTH, HALF_WIDTH = 0.078, 0.023
-"""How far from it the centre of pressure may go [m]; the contact spheres: 0.085, 0.025 to 0.03."""
+"""Maximum distance of the centre of pressure from it [m]; a little inside the contact spheres,
+which are at 0.085 and 0.025 to 0.03."""
 TWIST = 0.03
-"""Largest moment about the vertical that a foot bears, over its load [m]."""
+"""Maximum moment about the vertical on a foot, per vertical force [m]."""
 
 
 MAX_SWAY = np.array([0.036, 0.024])
-"""Largest shift of the centre of mass, forward and left [m]."""
+"""Maximum weight shift (displacement of the centre of mass), forward and left [m]."""
 SWAY_S = 0.24
-"""Shift of the centre of mass for a velocity that a standing robot is told [s]."""
+"""Weight shift per commanded velocity in stance [s]."""
 
 
 class Measured(NamedTuple):
-    """What the balance needs to know of each robot; world frame.
+    """Quantities of each robot that the balance needs, in the world frame.
 
     Attributes:
         com: Centre of mass [m]. Shape (n, 3).
-        com_velocity: Its velocity [m/s]. Shape (n, 3).
-        upper: Centre of mass of all but the legs [m]. Shape (n, 3).
-        soles: Middle of the left and right sole [m]. Shape (n, 2, 3).
-        feet: Rotation of each foot. Shape (n, 2, 3, 3).
-        sole_velocity: Velocity of each sole's middle [m/s]. Shape (n, 2, 3).
-        jacobian: Linear, then angular velocity of each sole by its leg's joints.
-            Shape (n, 2, 6, 6).
-        gravity: Torques that bear the links' weight [N m]. Shape (n, 29).
-        hands: Where forces on the hands act [m]. Shape (n, 2, 3).
+        com_velocity: Velocity of the centre of mass [m/s]. Shape (n, 3).
+        upper: Centre of mass of everything but the legs [m]. Shape (n, 3).
+        soles: Centres of the left and right sole [m]. Shape (n, 2, 3).
+        feet: Rotation matrix of each foot. Shape (n, 2, 3, 3).
+        sole_velocity: Velocity of each sole's centre [m/s]. Shape (n, 2, 3).
+        jacobian: Jacobian of each sole's centre with respect to its leg's joints, linear rows
+            first. Shape (n, 2, 6, 6).
+        gravity: Joint torques that compensate gravity [N m]. Shape (n, 29).
+        hands: Points of application of forces on the hands [m]. Shape (n, 2, 3).
     """
 
     com: np.ndarray
@@ -81,7 +82,7 @@ class Measured(NamedTuple):
 
 
 class Body:
-    """The planning model, on which robots are measured one after the other."""
+    """G1's planning model, on which `Measured` quantities are computed robot by robot."""
 
     def __init__(self) -> None:
         model = self._model = build_model(make_morphology("g1"), "planning")
@@ -97,13 +98,13 @@ class Body:
         self._leg_mass = float(model.body_subtreemass[self._legs[0]])
 
     def measure(self, qpos: np.ndarray, qvel: np.ndarray) -> Measured:
-        """Measure robots. Shapes (n, 36), (n, 35)."""
+        """Compute the quantities of n robots from qpos (n, 36) and qvel (n, 35)."""
         n, model, data = len(qpos), self._model, self._data
         shapes = ((3,), (3,), (3,), (2, 3), (2, 3, 3), (2, 3), (2, 6, LEG), (model.nu,), (2, 3))
         out = Measured(*(np.empty((n, *shape)) for shape in shapes))
         jacobian, force = np.empty((6, model.nv)), np.empty(model.nv)
         linear, angular = jacobian[:3], jacobian[3:]
-        data.qvel[:] = 0.0  # the torques of a robot at rest: gravity alone
+        data.qvel[:] = 0.0  # inverse dynamics at rest gives the torques of gravity alone
         for i in range(n):
             data.qpos[:] = qpos[i]
             mujoco.mj_kinematics(model, data)
@@ -128,18 +129,18 @@ class Body:
 
 @dataclass(frozen=True)
 class BalanceGains:
-    """Springs and dampers of the balance.
+    """Gains of the balance.
 
     Attributes:
-        capture: How far the centre of pressure leads the capture point, over the latter's
-            error [1].
-        height: Acceleration for the pelvis's error of height [1/s^2].
-        height_rate: And for its speed [1/s].
-        height_error: Largest such error that counts [m]; limits the speed of a squat.
-        turn: Angular acceleration for the pelvis's error of orientation [1/s^2].
-        turn_rate: And for its angular velocity [1/s].
-        inertia: About X, Y, Z of the heading frame [kg m^2].
-        moment: Largest moment that turns the pelvis [N m].
+        capture: Lead of the centre of pressure over the capture point, per error of the latter
+            [1].
+        height: Vertical acceleration per height error of the pelvis [1/s^2].
+        height_rate: Vertical deceleration per vertical velocity of the pelvis [1/s].
+        height_error: Saturation of the height error [m]; limits the speed of a squat.
+        turn: Angular acceleration per orientation error of the pelvis [1/s^2].
+        turn_rate: Angular deceleration per angular velocity of the pelvis [1/s].
+        inertia: Effective inertia of the pelvis about X, Y, Z of the heading frame [kg m^2].
+        moment: Maximum moment that rotates the pelvis [N m].
     """
 
     capture: float = 2.0
@@ -153,16 +154,15 @@ class BalanceGains:
 
 
 class Balanced(NamedTuple):
-    """What the balance would do, and whether it can.
+    """Output of the balance, and the quantities that decide whether it can act.
 
     Attributes:
-        targets: Targets of the legs [rad]. Shape (n, 12).
-        capture: Where the capture point is, from the middle of the feet, heading frame [m].
-            Shape (n, 2).
-        error: The same, from where it shall be [m]. Shape (n, 2).
-        half_width: Half of the support's width [m]. Shape (n,).
-        soles: Middle of the soles from their common middle, heading frame [m]. Shape (n, 2, 3).
-        tilt: Error of the pelvis's orientation, heading frame [rad]. Shape (n, 3).
+        targets: Joint targets of the legs [rad]. Shape (n, 12).
+        capture: Capture point from the midpoint of the feet, heading frame [m]. Shape (n, 2).
+        error: Capture point from its desired position, heading frame [m]. Shape (n, 2).
+        half_width: Half the width of the support [m]. Shape (n,).
+        soles: Centres of the soles from their midpoint, heading frame [m]. Shape (n, 2, 3).
+        tilt: Orientation error of the pelvis, heading frame [rad]. Shape (n, 3).
         pitch: Pitch of the pelvis [rad]. Shape (n,).
     """
 
@@ -176,15 +176,18 @@ class Balanced(NamedTuple):
 
 
 class Balance:
-    r"""Balance on two planted feet, wherever they stand.
+    r"""Balance controller for two planted feet at any placement.
 
-    The wanted wrench on the feet: bear the weight, bring the pelvis to its height and its
-    orientation by springs, and put the centre of pressure beyond the capture point
-    :math:`\xi = c + \dot c / \omega`, so that it returns to the middle of the feet. Forces on the
-    hands are borne by leaning against them. The feet share the wrench by where the centre of
-    pressure is between them, and :math:`\tau = g - \sum J_i^T f_i` are the torques of the legs.
-    The servos' targets are :math:`q + (\tau + k_d \dot q) / k_p`: the servos' damping of joints is
-    made up for, or else a squat would throw the robot on its nose.
+    The desired contact wrench carries the weight, drives the pelvis to its height and orientation
+    by springs and dampers, and puts the centre of pressure beyond the capture point
+    :math:`\xi = c + \dot c / \omega`, so that the latter returns to the midpoint of the feet. The
+    robot leans against forces on its hands. The feet share the wrench according to the centre of
+    pressure between them; the legs' torques are :math:`\tau = g - \sum J_i^T f_i`. The servos'
+    targets :math:`q + (\tau + k_d \dot q) / k_p` compensate the servos' damping, without which a
+    squat would tip the robot forward.
+
+    Args:
+        gains: Gains; None for the defaults.
     """
 
     def __init__(self, gains: BalanceGains | None = None) -> None:
@@ -200,15 +203,15 @@ class Balance:
         sway: np.ndarray,
         force: np.ndarray,
     ) -> Balanced:
-        """Compute the targets of the legs.
+        """Compute the joint targets of the legs.
 
         Args:
             qpos: Generalised positions. Shape (n, 36).
             qvel: Generalised velocities. Shape (n, 35).
-            measured: The same robots, measured.
-            height: Wanted height of the pelvis over the soles [m]. Shape (n,).
-            lean: Wanted pitch of the pelvis [rad]. Shape (n,).
-            sway: Wanted shift of the centre of mass, forward and left [m]. Shape (n, 2).
+            measured: Quantities of the same robots.
+            height: Desired height of the pelvis above the soles [m]. Shape (n,).
+            lean: Desired pitch of the pelvis [rad]. Shape (n,).
+            sway: Desired weight shift, forward and left [m]. Shape (n, 2).
             force: Forces on the hands, world [N]. Shape (n, 2, 3).
         """
         gains, mass, n = self.gains, self.body.mass, len(qpos)
@@ -223,7 +226,7 @@ class Balance:
         hands, push = turn(measured.hands - middle[:, None]), turn(force)
         pelvis = frame @ _compute_matrix(qpos[:, 3:7])
 
-        # The load on the feet, and where it would act if the robot stood still as it is.
+        # Vertical load on the feet, and the centre of pressure if the robot were at rest.
         weight = mass * GRAVITY
         load = np.maximum(weight - push[..., 2].sum(1), 0.5 * weight)
         at_rest = weight * com[:, :2] - (push[..., 2:] * hands[..., :2]).sum(1)
@@ -251,7 +254,7 @@ class Balance:
         along = mass * omega**2 * (at_rest - pressure) - push[..., :2].sum(1)
 
         total = np.concatenate([along, lift[:, None]], axis=1)
-        torque = moment.copy()  # about the middle of the feet
+        torque = moment.copy()  # about the midpoint of the feet
         torque[:, 0] += pressure[:, 1] * lift
         torque[:, 1] -= pressure[:, 0] * lift
         forces, torques = _share(soles, total, torque)
@@ -268,41 +271,43 @@ class Balance:
 
 
 def compute_back_share(height: np.ndarray) -> np.ndarray:
-    """How much of the sway backwards there is room for: low, the heels are near."""
+    """Return the possible fraction of a backward weight shift: low, the heels are near. (n,)."""
     return np.clip((height - 0.5) / 0.2, 0, 1)
 
 
 def compute_heel_shift(height: np.ndarray) -> np.ndarray:
-    """Where the centre of pressure shall be, before the middle of the feet [m].
+    """Return the desired centre of pressure ahead of the midpoint of the feet [m]. Shape (n,).
 
-    Low, the shins cannot tilt enough to keep it in the middle.
+    Low, the shins cannot tilt far enough to keep it at the midpoint.
     """
     return -0.01 * np.clip((0.6 - height) / 0.15, 0, 1)
 
 
 HIP, ANKLE = 0.1027, 0.0526
-"""Height of the pelvis over the hips and of the ankles over the ground [m]."""
+"""Height of the pelvis above the hips and of the ankles above the ground [m]."""
 THIGH, SHIN = 0.3367, 0.3
 """Lengths in the sagittal plane [m]."""
 LEG_MASSES = (4.572, 1.932, 0.682)
 """Masses of a thigh, shin and foot [kg]."""
 LEG_CENTRES = (0.478, 0.4, 0.024)
-"""Their centres: shares of the thigh from the hip and of the shin from the knee; before the
-ankle [m]."""
+"""Their centres of mass: fraction of the thigh from the hip, fraction of the shin from the knee,
+and distance of the foot's ahead of the ankle [m]."""
 ANKLE_LIMIT = -0.82
-"""Where an ankle's pitch is kept [rad]; it ends at -0.873."""
+"""Minimum ankle pitch that is used [rad], with a margin to the joint's limit of -0.873."""
 
 
 def compute_least_lean(height: np.ndarray, upper: np.ndarray, mass: float) -> np.ndarray:
-    """Compute the least pitch of the pelvis with which the robot can be so low.
+    """Compute the minimum pitch of the pelvis at which the robot can balance at a height.
 
-    Low, the hips are behind the feet, and the shins' tilt ends at the ankles' limit; the trunk
-    then has to lean. In the sagittal plane, feet side by side.
+    Low, the hips are behind the feet, and the ankles' limit ends the shins' tilt; the trunk then
+    has to lean. Computed in the sagittal plane with parallel feet: for each pitch on a grid the
+    hips are placed by five fixed-point steps so that the centre of mass is above its desired
+    position, and the pitch at which the ankles reach their limit is interpolated.
 
     Args:
         height: Height of the pelvis [m]. Shape (n,).
-        upper: Centre of mass of all but the legs, in the pelvis [m]. Shape (n, 3).
-        mass: Of the whole robot [kg].
+        upper: Centre of mass of everything but the legs, in the pelvis's frame [m]. Shape (n, 3).
+        mass: Mass of the whole robot [kg].
 
     Returns:
         Pitch, 0 to 0.7 rad. Shape (n,).
@@ -313,7 +318,7 @@ def compute_least_lean(height: np.ndarray, upper: np.ndarray, mass: float) -> np
     drop = height - HIP * np.cos(pitch) - ANKLE
     thigh, shin, foot = LEG_MASSES
     aim = SOLE[0] + compute_heel_shift(height)
-    hip = np.zeros_like(trunk)  # before the ankle
+    hip = np.zeros_like(trunk)  # distance ahead of the ankle [m]
     for _ in range(5):
         tilt = _compute_shin_tilt(hip, drop)
         knee = SHIN * np.sin(tilt)
@@ -321,7 +326,7 @@ def compute_least_lean(height: np.ndarray, upper: np.ndarray, mass: float) -> np
         com += 2 * thigh * (hip + LEG_CENTRES[0] * (knee - hip))
         com += 2 * (shin * (1 - LEG_CENTRES[1]) * knee + foot * LEG_CENTRES[2])
         hip += aim - com / mass
-    lack = _compute_shin_tilt(hip, drop) + ANKLE_LIMIT  # positive: too much for the ankles
+    lack = _compute_shin_tilt(hip, drop) + ANKLE_LIMIT  # positive beyond the ankles' limit
     first = np.where((lack <= 0).any(0), (lack <= 0).argmax(0), len(pitch) - 1)
     robots, before = np.arange(len(height)), np.maximum(first - 1, 0)
     more, less = lack[before, robots], lack[first, robots]
@@ -330,19 +335,22 @@ def compute_least_lean(height: np.ndarray, upper: np.ndarray, mass: float) -> np
 
 
 def _compute_shin_tilt(hip: np.ndarray, drop: np.ndarray) -> np.ndarray:
-    """Forward tilt of the shins for hips `hip` before and `drop` above the ankles [rad]."""
+    """Compute the shins' forward tilt for hips `hip` ahead of and `drop` above the ankles [rad]."""
     length = np.clip(np.hypot(hip, drop), 0.1, THIGH + SHIN - 1e-3)
     cos = (SHIN**2 + length**2 - THIGH**2) / (2 * SHIN * length)
     return np.arctan2(hip, drop) + np.arccos(np.clip(cos, -1, 1))
 
 
 def compute_lean(command: np.ndarray) -> np.ndarray:
-    """Commanded pitch of the pelvis: what the waist's joint can't take [rad]. (n, 7) -> (n,)."""
+    """Return the pelvis's part of the commanded pitch: the part beyond the waist's range [rad].
+
+    Shapes (n, 7) -> (n,).
+    """
     return np.clip(command[:, PITCH] - LEAN_FROM, 0.0, MAX_LEAN)
 
 
 def compute_velocity(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """Velocity in the heading frame: vx, vy [m/s], yaw rate [rad/s]. Shape (n, 3)."""
+    """Compute the velocity in the heading frame: vx, vy [m/s], yaw rate [rad/s]. Shape (n, 3)."""
     yaw = quat_yaw(qpos[:, 3:7])
     cos, sin = np.cos(yaw), np.sin(yaw)
     vx, vy = qvel[:, 0], qvel[:, 1]
@@ -351,12 +359,12 @@ def compute_velocity(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
 
 
 def _compute_matrix(quat: np.ndarray) -> np.ndarray:
-    """Rotation matrices of quaternions. Shape (n, 4) -> (n, 3, 3)."""
+    """Convert quaternions wxyz to rotation matrices. Shape (n, 4) -> (n, 3, 3)."""
     return np.stack([quat_rotate(quat, axis) for axis in np.eye(3)], axis=2)
 
 
 def _compute_heading_frame(feet: np.ndarray) -> np.ndarray:
-    """Rotation from the world to the feet's mean heading. Shape (n, 2, 3, 3) -> (n, 3, 3)."""
+    """Compute the rotation from world to the feet's mean heading. (n, 2, 3, 3) -> (n, 3, 3)."""
     along = feet[..., :2, 0].sum(1)
     cos, sin = (along / np.linalg.norm(along, axis=1, keepdims=True)).T
     frame = np.zeros((len(feet), 3, 3))
@@ -366,7 +374,7 @@ def _compute_heading_frame(feet: np.ndarray) -> np.ndarray:
 
 
 def _compute_rotation_error(lean: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
-    """Rotation vector, for small errors, from `pelvis` to pitch `lean` alone. Shape (n, 3)."""
+    """Compute the rotation vector from `pelvis` to pure pitch `lean`, for small errors. (n, 3)."""
     wanted = np.zeros_like(pelvis)
     wanted[:, 0, 0] = wanted[:, 2, 2] = np.cos(lean)
     wanted[:, 0, 2] = np.sin(lean)
@@ -379,10 +387,17 @@ def _compute_rotation_error(lean: np.ndarray, pelvis: np.ndarray) -> np.ndarray:
 def _share(
     soles: np.ndarray, force: np.ndarray, torque: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Share a wrench about the middle of the feet among the two soles.
+    """Distribute a wrench about the midpoint of the feet between the two soles.
+
+    The forces are parallel; the residual torque is limited to what each sole can bear.
+
+    Args:
+        soles: Centres of the soles from their midpoint [m]. Shape (n, 2, 3).
+        force: Force of the wrench [N]. Shape (n, 3).
+        torque: Torque of the wrench [N m]. Shape (n, 3).
 
     Returns:
-        Forces and torques at the middles of the soles. Shapes (n, 2, 3).
+        Forces and torques at the centres of the soles. Shapes (n, 2, 3).
     """
     spread = np.maximum(soles[:, 0, 1] - soles[:, 1, 1], 0.05)
     left = np.clip((torque[:, 0] / force[:, 2] - soles[:, 1, 1]) / spread, 0.03, 0.97)
@@ -395,22 +410,24 @@ def _share(
 
 @dataclass(frozen=True)
 class Handover:
-    """When the balance acts, and when FALCON.
+    """Conditions under which the balance acts, and otherwise FALCON.
 
     Attributes:
-        hold: Part of the support within which the balance goes on [1].
-        take: Part of it within which it takes over [1].
-        flat: Largest tilt of a planted foot [rad].
-        clear: Largest height of its middle over the ground [m].
-        still: Largest speed of a foot that is about to be stood on [m/s].
-        spread: Least and largest distance of the feet across [m].
-        stagger: And largest along the heading [m].
-        sinks: Below this height of the pelvis, and leaning more than `leans`, a robot that is
-            to walk stands up first [m].
-        stands: From this height on, and leaning less, FALCON walks [m].
-        leans: See above [rad].
+        hold: Fraction of the support within which the capture point must stay for the balance to
+            go on [1].
+        take: Fraction of the support within which the capture point's error must be for the
+            balance to take over [1].
+        flat: Maximum tilt of a planted foot [rad].
+        clear: Maximum height of a planted sole's centre above the ground [m].
+        still: Maximum speed of the soles when the balance takes over [m/s].
+        spread: Minimum and maximum lateral distance of the feet then [m].
+        stagger: Maximum distance of the feet along the heading then [m].
+        sinks: Pelvis height below which a robot commanded to walk stands up first [m].
+        stands: Pelvis height above which, once standing up, it walks [m].
+        leans: Pitch of the pelvis above which a robot commanded to walk stands up first; below
+            half of it, it walks [rad].
         blend_s: Time in which the balance takes over [s].
-        yield_s: Time in which FALCON does [s].
+        yield_s: Time in which FALCON takes over [s].
     """
 
     hold: float = 1.0
@@ -428,29 +445,29 @@ class Handover:
 
 
 STEP_HEIGHT, WALK_HEIGHT = 0.62, 0.68
-"""Least height that FALCON is told while it stands and while it walks [m]; lower, it loses its
+"""Minimum heights commanded to FALCON while it stands and while it walks [m]; lower, it loses its
 footing."""
 RISE = 0.73
 """Height to which a low robot rises before it walks [m]."""
 TRIM = np.array([0.06, 0.03, -0.06])
-"""What FALCON is told beyond the command while it walks, since it drifts: vx, vy [m/s], yaw
-rate [rad/s]."""
+"""Offset of the velocity commanded to FALCON, against its drift: vx, vy [m/s], yaw rate [rad/s]."""
 FEEDBACK = np.array([1.5, 1.5, 0.7])
-"""And for the error of the velocity of now [1]; more of it makes the body's yaw swing."""
+"""Feedback gains of the velocity commanded to FALCON on the velocity error [1]; higher gains make
+the body's yaw oscillate."""
 MAX_ERROR = 0.5
-"""Largest error of a velocity that counts [m/s, rad/s]."""
+"""Saturation of the velocity error [m/s, rad/s]."""
 SUPPORT = 0.08
-"""Half of the support's length [m]."""
+"""Half the length of the support [m]."""
 
 
 class Taught(NamedTuple):
-    """What the teacher does.
+    """Output of the teacher.
 
     Attributes:
         targets: Motor targets [rad]. Shape (n, 29).
-        actions: Outputs of a network that does the same. Shape (n, 29).
+        actions: Network outputs that give the same targets. Shape (n, 29).
         memory: FALCON's memory after the step. Shape (n, nm).
-        share: How much the balance acts, 0 to 1. Shape (n,).
+        share: Weight of the balance against FALCON, 0 to 1. Shape (n,).
     """
 
     targets: np.ndarray
@@ -460,15 +477,15 @@ class Taught(NamedTuple):
 
 
 class Teacher:
-    """FALCON and `Balance`.
+    """The teacher: a blend of FALCON and `Balance`.
 
-    The arms' part of the action bears their weight on their soft servos, computed from the model,
-    since FALCON does so only in the postures that it was trained with.
+    The arms' actions compensate gravity on their soft servos, computed from the model, since
+    FALCON does so only in the postures that it was trained with.
 
     Args:
         path: FALCON's ONNX file; None for the cached or downloaded one.
-        gains: Of the balance.
-        handover: When it acts.
+        gains: Gains of the balance; None for the defaults.
+        handover: Conditions under which the balance acts; None for the defaults.
     """
 
     def __init__(
@@ -483,7 +500,7 @@ class Teacher:
         self._centre = JOINTS.spread(network.default, 0.0)
 
     def initial_memory(self, n: int) -> np.ndarray:
-        """FALCON's. Shape (n, nm)."""
+        """Return FALCON's initial memory. Shape (n, nm)."""
         return self.falcon.initial_memory(n)
 
     def teach(
@@ -497,17 +514,17 @@ class Teacher:
         force: np.ndarray,
         share: np.ndarray,
     ) -> Taught:
-        """Compute motor targets for the next 20 ms.
+        """Compute motor targets for the next policy step of 20 ms.
 
         Args:
             true: Generalised positions and velocities. Shapes (n, 36), (n, 35).
-            sensed: The same with the sensors' noise, as the student sees them.
+            sensed: The same with sensor noise, as the student sees them.
             command: Commands. Shape (n, 7).
             arms: Arm targets [rad]. Shape (n, 14).
-            memory: FALCON's memory, its last outputs those of whoever drove. Shape (n, nm).
-            mode: Mode of each. Shape (n,).
+            memory: FALCON's memory, with the executed actions as its last. Shape (n, nm).
+            mode: Mode of each robot. Shape (n,).
             force: Forces on the hands, world [N]. Shape (n, 2, 3).
-            share: How much the balance acted; zero at first. Shape (n,).
+            share: The previous `Taught.share`; zero at first. Shape (n,).
         """
         qpos, qvel = true
         walks = mode == Mode.MOBILE
@@ -522,13 +539,14 @@ class Teacher:
         share = np.clip(share, 0, 1)
 
         told = self._tell(command, walks, compute_velocity(qpos, qvel))
-        where = sensed[0][:, JOINTS.positions][:, ARMS]  # FALCON minds arms that are held up
+        # The measured angles serve as arm targets: obstructed arms would disturb FALCON.
+        where = sensed[0][:, JOINTS.positions][:, ARMS]
         _, after = self.falcon.act(*sensed, told, where, memory, mode)
         own = np.zeros((len(qpos), len(JOINTS.names)))
         own[:, LEGS] = balanced.targets
         own[:, WAIST] = command[:, COMMANDED_WAIST]
         own = (np.clip(own, JOINTS.low, JOINTS.high) - self._centre) / ACTION_SCALE
-        own[:, WAIST.start + 1 : WAIST.stop] = 0.0  # roll and pitch are moved by the command alone
+        own[:, WAIST.start + 1 : WAIST.stop] = 0.0  # roll and pitch follow the command directly
         actions = after[:, ACTIONS]
         actions += share[:, None] * (own - actions)
         actions[:, ARMS] = (measured.gravity / JOINTS.stiffness)[:, ARMS] / ACTION_SCALE
@@ -538,7 +556,7 @@ class Teacher:
         return Taught(np.clip(targets, JOINTS.low, JOINTS.high), actions.copy(), after, share)
 
     def _tell(self, command: np.ndarray, walks: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """What FALCON is told in place of the command. Shape (n, 7)."""
+        """Compute FALCON's command: raised heights, and velocities with feedback. Shape (n, 7)."""
         told = command.copy()
         np.maximum(told[:, 0], np.where(walks, WALK_HEIGHT, STEP_HEIGHT), out=told[:, 0])
         wanted = np.where(walks[:, None], command[:, VELOCITIES], 0.0)
@@ -554,7 +572,15 @@ class Teacher:
         walks: np.ndarray,
         acted: np.ndarray,
     ) -> np.ndarray:
-        """Tell for which robots the balance acts now. Shape (n,)."""
+        """Decide for which robots the balance acts now. Shape (n,), bool.
+
+        Args:
+            qpos: Generalised positions. Shape (n, 36).
+            measured: Quantities of the robots.
+            balanced: Output of the balance.
+            walks: Whether each robot is commanded to walk. Shape (n,).
+            acted: Whether the balance acted in the last step; gives hysteresis. Shape (n,).
+        """
         rules, soles = self.handover, measured.soles
         clear = np.abs(soles[..., 2]).max(1) < rules.clear
         flat = (measured.feet[..., 2, 2] > np.cos(rules.flat)).all(1)

@@ -1,6 +1,7 @@
-"""Make `.venv` and install the project in it; started by `setup.sh` with a Python that fits.
+"""Create `.venv` and install the project in it; started by `setup.sh` with a suitable Python.
 
-Standard library only, since nothing is installed yet. docs/start/setup.md explains the steps.
+Uses only the standard library, since nothing is installed yet. docs/start/setup.md explains the
+steps.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ LOCK_FILE = ROOT / "requirements.lock"
 MINOR = f"{sys.version_info.major}.{sys.version_info.minor}"
 
 NEEDED_GB = 8.0
-"""Room for `.venv` (7 GB) and the archives on their way into it [GB]."""
+"""Disk space for `.venv` (7 GB) and the archives downloaded for it [GB]."""
 RENDER_CHECK = """
 import mujoco
 model = mujoco.MjModel.from_xml_string(
@@ -38,7 +39,7 @@ data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
 with mujoco.Renderer(model, 48, 64) as renderer:
     renderer.update_scene(data)
-    assert renderer.render().max() > 0, "the picture is black"
+    assert renderer.render().max() > 0, "the image is black"
 """
 
 VENV_MODULE = "Python's venv"
@@ -65,7 +66,7 @@ PACKAGES = {
         "pacman": "python",
         "zypper": f"python{MINOR.replace('.', '')}-devel",
     },
-    # What tests of pages need: npm brings Node.js, and fetches the headset's emulator.
+    # Needed by the tests of web pages: npm installs Node.js and the headset's emulator.
     "Chromium": dict.fromkeys(("apt-get", "dnf", "pacman", "zypper"), "chromium"),
     "certutil": {
         "apt-get": "libnss3-tools",
@@ -75,7 +76,7 @@ PACKAGES = {
     },
     "npm": {"apt-get": "npm", "dnf": "npm", "pacman": "npm", "zypper": "npm-default"},
 }
-"""The packages of each package manager that bring a thing which pip and uv can't."""
+"""Packages that provide what pip and uv can't, by requirement and package manager."""
 INSTALL_COMMANDS = {
     "apt-get": "apt-get install -y --no-install-recommends",
     "dnf": "dnf install -y",
@@ -97,26 +98,26 @@ UV_SETTINGS = {
     "cert": "SSL_CERT_FILE",
     "proxy": "ALL_PROXY",
 }
-"""pip's settings that uv has too, by the variable that tells uv."""
+"""Environment variables of uv that correspond to settings of pip."""
 
 
 class SetupError(Exception):
-    """The set-up can't go on; the message says what to do."""
+    """The set-up can't continue; the message says what to do."""
 
 
 def say(line: str) -> None:
-    """Print one line at once."""
+    """Print one line without buffering."""
     print(line, flush=True)
 
 
 def make_clean_environment() -> dict[str, str]:
-    """Return the environment less what would lead pip to another Python's packages."""
+    """Return the environment without variables that point pip to another Python's packages."""
     unwanted = {"PYTHONPATH", "PYTHONHOME", "PIP_TARGET", "PIP_PREFIX", "PIP_USER"}
     return {key: value for key, value in os.environ.items() if key not in unwanted}
 
 
-def ask(*command: str | Path) -> str | None:
-    """Return what a command prints, None where it fails or can't be started."""
+def read_output(*command: str | Path) -> str | None:
+    """Return the output of a command, or None if it fails or can't be started."""
     try:
         answer = subprocess.run(
             command, env=make_clean_environment(), capture_output=True, text=True, check=True
@@ -127,24 +128,24 @@ def ask(*command: str | Path) -> str | None:
 
 
 def run(*command: str | Path, environment: dict[str, str] | None = None) -> None:
-    """Run a command that installs something, its output as it comes.
+    """Run a command that installs something, showing its output.
 
     Raises:
-        SetupError: If it fails.
+        SetupError: If the command fails.
     """
     environment = environment or make_clean_environment()
     if subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode:
         raise SetupError(
-            f"the command above failed:\n  {' '.join(map(str, command))}\nRun `make` again after "
-            "mending it; what is there already stays."
+            f"the command above failed:\n  {' '.join(map(str, command))}\nFix the cause and run "
+            "`make` again; what is already installed is kept."
         )
 
 
-# -- what the system has to bring ---------------------------------------------------------------
+# -- system packages ----------------------------------------------------------------------------
 
 
 def is_loadable(library: str) -> bool:
-    """Whether the dynamic linker finds `library`."""
+    """Return whether the dynamic linker finds `library`."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -153,10 +154,10 @@ def is_loadable(library: str) -> bool:
 
 
 def list_missing() -> list[str]:
-    """List what this system lacks to install the project and to render."""
+    """List the requirements for installing and rendering that this system lacks."""
     linux = sys.platform == "linux"
     renders = linux and os.environ.get("MUJOCO_GL", "egl") == "egl"
-    # LeRobot needs evdev, which is published as source alone.
+    # LeRobot depends on evdev, which is published only as source.
     builds = linux and not any(VENV.glob(f"lib/python{MINOR}/site-packages/evdev/__init__.py"))
     has_compiler = shutil.which("cc") or shutil.which("gcc")
     missing = {
@@ -169,7 +170,7 @@ def list_missing() -> list[str]:
 
 
 def has_browser() -> bool:
-    """Whether the tests find a Chromium: named, on the path, or Playwright's own."""
+    """Return whether the tests find Chromium: in $CHROMIUM, on the path, or Playwright's own."""
     if os.environ.get("CHROMIUM") or any(map(shutil.which, BROWSERS)):
         return True
     caches = [Path.home() / folder / "ms-playwright" for folder in (".cache", "Library/Caches")]
@@ -179,50 +180,50 @@ def has_browser() -> bool:
 
 
 def list_missing_test_tools() -> list[str]:
-    """List what the tests of pages lack here; they skip without it."""
+    """List the missing tools without which the tests of web pages are skipped."""
     missing = [] if has_browser() else ["Chromium"]
     return missing + [tool for tool in ("certutil", "npm") if not shutil.which(tool)]
 
 
 def find_manager() -> str | None:
-    """Return the system's package manager, None where it is none that is known here."""
+    """Return the system's package manager, or None if there is no supported one."""
     return next(filter(shutil.which, INSTALL_COMMANDS), None)
 
 
 def find_root_prefix() -> tuple[str, ...] | None:
-    """Return what makes a command run as root without a question, None where that may not be."""
+    """Return a command prefix to run as root without a password, or None if not permitted."""
     if os.environ.get("XOP_NO_SYSTEM", "0") == "1":
         return None
     if os.geteuid() == 0:
         return ()
-    return ("sudo", "-n") if ask("sudo", "-n", "true") is not None else None
+    return ("sudo", "-n") if read_output("sudo", "-n", "true") is not None else None
 
 
-def bring(list_missing: Callable[[], list[str]]) -> list[str]:
-    """Install what `list_missing` names where that may be; errors of the package manager show.
+def install_missing(list_missing: Callable[[], list[str]]) -> list[str]:
+    """Install what `list_missing` names, if permitted, showing the package manager's errors.
 
     Returns:
-        What is missing still.
+        What is still missing.
     """
     missing, manager = list_missing(), find_manager()
     if not missing or manager is None or (prefix := find_root_prefix()) is None:
         return missing
     packages = list_packages(missing, manager)
     say(f"Installing {' '.join(packages)} (XOP_NO_SYSTEM=1 forbids it)")
-    if manager == "apt-get":  # its lists may be old or absent
+    if manager == "apt-get":  # its package lists may be outdated or absent
         run_as_root(prefix, "apt-get update")
-    for some in packages:  # each by itself: one without a package keeps nothing else out
-        run_as_root(prefix, f"{INSTALL_COMMANDS[manager]} {some}")
+    for group in packages:  # one at a time: an unavailable package must not block the others
+        run_as_root(prefix, f"{INSTALL_COMMANDS[manager]} {group}")
     return list_missing()
 
 
 def list_packages(missing: list[str], manager: str) -> list[str]:
-    """List what `manager` is to install for each thing that is missing."""
+    """List the packages of `manager` that provide each missing requirement."""
     return [PACKAGES[name][manager] for name in missing if manager in PACKAGES[name]]
 
 
 def run_as_root(prefix: tuple[str, ...], command: str) -> None:
-    """Run a command of the package manager; only what it says of errors shows."""
+    """Run a command of the package manager, showing only its errors; failure is ignored."""
     subprocess.run(
         [*prefix, *command.split()],
         env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"},
@@ -233,23 +234,23 @@ def run_as_root(prefix: tuple[str, ...], command: str) -> None:
 
 
 def describe_missing(missing: list[str], consequence: str = "") -> str:
-    """Say what is missing, what follows, and the command that brings it."""
+    """Describe what is missing, the consequence, and the command that installs it."""
     *others, last = missing
     named = f"{', '.join(others)} and {last} are" if others else f"{last} is"
     manager = find_manager()
-    way = "Install with the system's package manager"
+    remedy = "Install with the system's package manager"
     if manager is not None:
         packages = " ".join(list_packages(missing, manager))
-        way = f"Run:\n  sudo {INSTALL_COMMANDS[manager]} {packages}"
-    return f"{named} missing{consequence}. {way}"
+        remedy = f"Run:\n  sudo {INSTALL_COMMANDS[manager]} {packages}"
+    return f"{named} missing{consequence}. {remedy}"
 
 
-def bring_test_tools() -> None:
-    """Install what tests of pages need, where that may be; else say what to run, and go on."""
+def install_test_tools() -> None:
+    """Install the tools for tests of web pages if permitted; else print how to, and continue."""
     if not list_missing_test_tools():
         return
     with hold_lock():
-        missing = bring(list_missing_test_tools)
+        missing = install_missing(list_missing_test_tools)
     if missing:
         say(describe_missing(missing, ": tests of pages will skip"))
     if "Chromium" in missing:
@@ -260,42 +261,42 @@ def bring_test_tools() -> None:
 
 
 def make_uv_environment(pip_settings: str) -> dict[str, str]:
-    """Return the environment with pip's settings in uv's words: uv doesn't read pip's files.
+    """Return the environment with pip's settings as uv's variables: uv doesn't read pip's files.
 
     Args:
-        pip_settings: What `pip config list` prints.
+        pip_settings: Output of `pip config list`.
     """
     environment = make_clean_environment()
     settings = dict(line.split("=", 1) for line in pip_settings.splitlines() if "=" in line)
     for section in (":env:.", "install.", "global."):  # the first has precedence
         for option, name in UV_SETTINGS.items():
             words = ast.literal_eval(settings.get(section + option, "''")).split()
-            # pip passes over a folder that doesn't exist, uv doesn't.
+            # pip ignores a folder that doesn't exist, uv fails.
             words = [word for word in words if not word.startswith("/") or Path(word).exists()]
             if words:
                 separator = "," if option == "find-links" else " "
                 environment.setdefault(name, separator.join(words))
-    if "UV_INDEX" in environment:  # pip takes the best version of all indexes, uv the first index
+    if "UV_INDEX" in environment:  # as pip: the best version of all indexes, not the first index
         environment.setdefault("UV_INDEX_STRATEGY", "unsafe-best-match")
     return environment
 
 
 def is_venv_usable() -> bool:
-    """Whether `.venv` is of this interpreter's version and its pip runs."""
-    version = ask(PYTHON, "-I", "-c", "import pip, sys; print(sys.version_info[:3])")
+    """Return whether `.venv` has this interpreter's version and a working pip."""
+    version = read_output(PYTHON, "-I", "-c", "import pip, sys; print(sys.version_info[:3])")
     return version == f"{tuple(sys.version_info[:3])}\n"
 
 
 def make_venv() -> None:
-    """Make `.venv`, anew where what is there can't be used.
+    """Create `.venv`, replacing one that can't be used.
 
     Raises:
-        SetupError: If there is too little room, or `venv` fails.
+        SetupError: If there is too little disk space, or `venv` fails.
     """
     if is_venv_usable():
         return
     if VENV.exists() or VENV.is_symlink():
-        say("Replacing .venv: it is broken or of another Python.")
+        say("Replacing .venv: it is broken or belongs to another Python.")
         VENV.unlink() if VENV.is_symlink() else shutil.rmtree(VENV)
     free_gb = shutil.disk_usage(ROOT).free / 1e9
     if free_gb < NEEDED_GB:
@@ -304,37 +305,37 @@ def make_venv() -> None:
 
 
 def install_project() -> None:
-    """Install the project and what it needs, at the lock's versions and hashes.
+    """Install the project and its dependencies in the lock's versions, checked by their hashes.
 
-    By uv; by pip where no uv can be had, or where `XOP_INSTALLER=pip` asks for it.
+    With uv, or with pip if uv can't be installed or `XOP_INSTALLER=pip` is set.
 
     Raises:
-        SetupError: If that fails.
+        SetupError: If the installation fails.
     """
     pip = (PYTHON, "-I", "-m", "pip", "--disable-pip-version-check")
     try:
         if os.environ.get("XOP_INSTALLER") == "pip":
-            raise SetupError("pip was asked for")
+            raise SetupError("XOP_INSTALLER=pip")
         (pin,) = re.findall(r"^uv==.*(?:\n +--hash.*)*", LOCK_FILE.read_text(), re.MULTILINE)
         (VENV / "uv.txt").write_text(pin)
         run(*pip, "install", "--quiet", "--requirement", VENV / "uv.txt")
     except SetupError:
-        say("pip installs, as there is no uv; it takes longer.")
+        say("Installing with pip instead of uv; this takes longer.")
         run(*pip, "install", "--requirement", LOCK_FILE)
         run(*pip, "install", "--no-deps", "--no-build-isolation", "--editable", ROOT)
     else:
         run(
             *(VENV / "bin" / "uv", "pip", "install", "--python", PYTHON),
             *("--compile-bytecode", "--constraints", LOCK_FILE, "--editable", f"{ROOT}[dev]"),
-            environment=make_uv_environment(ask(*pip, "config", "list") or ""),
+            environment=make_uv_environment(read_output(*pip, "config", "list") or ""),
         )
 
 
 def check_rendering() -> None:
-    """Render a small picture, as the robots' cameras do.
+    """Render a small image, as the robots' cameras do.
 
     Raises:
-        SetupError: If that fails, with the command that mends it.
+        SetupError: If rendering fails, with the command that may fix it.
     """
     backend = os.environ.get("MUJOCO_GL", "egl")
     if sys.platform != "linux" or backend in {"0", "disable", "disabled", "false", "off"}:
@@ -352,23 +353,23 @@ def check_rendering() -> None:
         command = f"{INSTALL_COMMANDS[manager]} {PACKAGES[RENDERING][manager]}"
         raise SetupError(
             f"MuJoCo can't render with MUJOCO_GL={backend}: {fault}\nTry: sudo {command}\n"
-            "or go on without cameras: MUJOCO_GL=disabled"
+            "or continue without cameras: MUJOCO_GL=disabled"
         )
 
 
 def drop_unloadable_torchcodec() -> None:
-    """Remove torchcodec where it can't load, as on a machine without FFmpeg's libraries.
+    """Remove torchcodec if it can't be loaded, as on a machine without FFmpeg's libraries.
 
-    LeRobot then decodes videos with PyAV, as it would anyhow, but without a hundred lines of
-    tracebacks at each start.
+    LeRobot would fall back to PyAV anyway, but only after printing a hundred lines of tracebacks
+    at each start.
     """
-    if ask(PYTHON, "-I", "-c", "import torchcodec") is None:
+    if read_output(PYTHON, "-I", "-c", "import torchcodec") is None:
         run(PYTHON, "-I", "-m", "pip", "uninstall", "--quiet", "--yes", "torchcodec")
 
 
 @contextmanager
 def hold_lock() -> Iterator[None]:
-    """Let one set-up of this checkout run at a time; the lock is on this very file."""
+    """Hold the lock of this checkout's set-up, on this file; waits for another set-up."""
     with Path(__file__).open() as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -379,29 +380,33 @@ def hold_lock() -> Iterator[None]:
 
 
 def set_up(stamp: str, install: Callable[[], None]) -> bool:
-    """Run `install` and write `stamp`, unless `.venv` carries that stamp already.
+    """Run `install` and write `stamp`, unless `.venv` already has that stamp.
 
     Returns:
-        Whether anything was done.
+        Whether `install` was run.
     """
     with hold_lock():
         if STAMP.exists() and STAMP.read_text().strip() == stamp and is_venv_usable():
             return False
-        STAMP.unlink(missing_ok=True)
+        STAMP.unlink(missing_ok=True)  # an interrupted set-up must not count as complete
         install()
         STAMP.write_text(f"{stamp}\n")
     return True
 
 
 def install_all() -> None:
-    """Make the environment and install system packages and the project."""
+    """Install system packages, create the environment and install the project in it.
+
+    Raises:
+        SetupError: If any step fails.
+    """
     version = ".".join(map(str, sys.version_info[:3]))
     first = not is_venv_usable()
     say(
         f"Setting up xop-lerobot in .venv with Python {version} ({sys.executable})."
         + (" The first time takes 1 to 4 minutes and 7 GB." if first else "")
     )
-    if missing := bring(list_missing):
+    if missing := install_missing(list_missing):
         raise SetupError(describe_missing(missing))
     make_venv()
     install_project()
@@ -410,13 +415,13 @@ def install_all() -> None:
 
 
 def main() -> int:
-    """Run the set-up and return its exit status."""
+    """Run the set-up; returns its exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--stamp", help="what setup.sh computed from the files that matter")
-    parser.add_argument("--test-tools", action="store_true", help="bring what tests need beside")
+    parser.add_argument("--stamp", help="hash of the files that decide the installation")
+    parser.add_argument("--test-tools", action="store_true", help="install the tests' tools only")
     arguments = parser.parse_args()
     if arguments.test_tools:
-        bring_test_tools()
+        install_test_tools()
         return 0
     if not arguments.stamp:
         parser.error("run scripts/setup.sh, which starts this with --stamp")
@@ -427,7 +432,7 @@ def main() -> int:
         print(f"set-up failed: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("\nset-up stopped; the same command goes on with it.", file=sys.stderr)
+        print("\nset-up interrupted; run the same command to resume it.", file=sys.stderr)
         return 130
     if done:
         say(f"Set up in {time.monotonic() - begun:.0f} s. The next start takes no time.")

@@ -1,22 +1,23 @@
 #!/bin/sh
-# Make .venv ready: find a Python that fits, then hand over to setup.py, unless nothing changed.
+# Set up .venv: find a suitable Python and run setup.py with it, unless nothing has changed.
 #
-#   sh scripts/setup.sh                set up, or start at once when it is done already
+#   sh scripts/setup.sh                set up, or return at once if .venv is up to date
 #   sh scripts/setup.sh --print-python only print the interpreter that would be used
 #
-# XOP_PYTHON=/path/to/python chooses the interpreter; XOP_NO_SYSTEM=1 forbids system packages.
-# docs/start/setup.md says what is done and why.
+# XOP_PYTHON=/path/to/python selects the interpreter; XOP_NO_SYSTEM=1 forbids installing system
+# packages. docs/start/setup.md explains the steps.
 set -eu
 cd "$(dirname "$0")/.."
 home=${HOME:-/root}
 
-# Anything that changes what has to be installed, and where: a moved checkout breaks its .venv.
+# Print a hash of everything that decides what is installed and where. It includes the path,
+# because the scripts in a .venv contain absolute paths and break when the checkout is moved.
 stamp() {
     { pwd -P; cat pyproject.toml requirements.lock scripts/setup.sh scripts/setup.py; } |
         { sha256sum 2>/dev/null || cksum; } | cut -d ' ' -f 1
 }
 
-# Print "3.12.1" when $1 runs.
+# Print the version of the interpreter $1, such as 3.12.1, or nothing if it does not run.
 version_of() {
     "$1" -I -S -c 'import sys; print("%d.%d.%d" % sys.version_info[:3])' 2>/dev/null || true
 }
@@ -27,8 +28,8 @@ can_make_environments() {
     "$1" -I -c 'import ensurepip, venv, ssl, ctypes' >/dev/null 2>&1
 }
 
-# Every interpreter worth a look, the tested 3.12 before 3.13, one a line. A pyenv shim exists
-# for versions that it then refuses to run, so the versions' own folders are looked at as well.
+# Print candidate interpreters, one per line, 3.12 before 3.13. A pyenv shim may exist for a version
+# that it then refuses to run, so the folders of the versions are searched as well.
 candidates() {
     for minor in 3.12 3.13; do
         command -v "python$minor" || true
@@ -47,14 +48,14 @@ candidates() {
     done
 }
 
-# Let uv download a Python: the uv on the path, or one that an older or newer Python's pip brings.
+# Download Python 3.12 with uv: the installed uv, or one that pip of any other Python installs.
 download_python() {
     folder=$(mktemp -d) || return 1
     uv=$(command -v uv || ls "$home/.local/bin/uv" 2>/dev/null || true)
     if [ -z "$uv" ]; then
         uv=$folder/bin/uv
         python3 -m venv "$folder" >&2 && "$folder/bin/python" -m pip install --quiet uv >&2
-    fi && echo "Python 3.12 is brought by uv." >&2 && "$uv" python install --no-bin 3.12 >&2 &&
+    fi && echo "Installing Python 3.12 with uv." >&2 && "$uv" python install --no-bin 3.12 >&2 &&
         python=$("$uv" python find --managed-python 3.12)
     status=$?
     rm -rf "$folder"
@@ -107,7 +108,7 @@ find_python() {
         seen="$seen  $path: ${version:-does not run}
 "
     done
-    # setup.py brings the package that Debian and Ubuntu keep `venv` in, or names it.
+    # Debian and Ubuntu package `venv` separately: setup.py installs that package, or names it.
     python=$without_venv
     [ -n "$python" ] || download_python || no_python "$seen"
 }

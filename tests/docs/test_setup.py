@@ -294,7 +294,7 @@ def test_a_failing_package_manager_shows_its_words(
 ) -> None:
     monkeypatch.setattr(setup, "find_manager", lambda: "dnf")
     monkeypatch.setattr(setup, "find_root_prefix", lambda: ("sh", "-c", "echo no mirror >&2"))
-    assert setup.bring(lambda: [setup.COMPILER]) == [setup.COMPILER]
+    assert setup.install_missing(lambda: [setup.COMPILER]) == [setup.COMPILER]
     assert "no mirror" in capfd.readouterr().err
 
 
