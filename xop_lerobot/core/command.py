@@ -95,7 +95,7 @@ class CommandSpace:
 
     def _column(self, field: str) -> np.ndarray:
         column = np.array([getattr(dim, field) for dim in self.dims], dtype=float)
-        column.setflags(write=False)
+        column.setflags(write=False)  # cached, so all callers share the array
         return column
 
     @cached_property
@@ -169,6 +169,7 @@ class CommandSpace:
                 raise BadValue(f"the policy's stop rate must be of a velocity, got {name!r}")
             dims[i] = replace(dims[i], stop_rate=float(rate))
         fitted = replace(self, dims=tuple(dims), ranges=ranges, dead_zones=dead_zones)
+        # Entries get the widest bounds of both modes; neutral must lie within them.
         low = np.min([fitted.bounds(mode)[0] for mode in Mode], axis=0)
         high = np.max([fitted.bounds(mode)[1] for mode in Mode], axis=0)
         bounded = tuple(
@@ -391,6 +392,7 @@ class ActionLayout:
             flat[key] = number
         column = np.array(list(flat.values()))
         k = len(self.space)
+        # In LeRobot's actions the mode is a float, which a learned policy hits only roughly.
         mode = Mode.MOBILE if column[k] >= 0.5 else Mode.STATIONARY
         return RobotAction(column[:k], mode, column[k + 1 :])
 

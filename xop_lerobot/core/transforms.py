@@ -77,9 +77,11 @@ def quat_exp(rotvec: np.ndarray) -> np.ndarray:
 def quat_log(q: np.ndarray) -> np.ndarray:
     """Rotation vector of a unit quaternion, angle in [0, pi] [rad]. Shape (..., 4) -> (..., 3)."""
     q = np.asarray(q, float)
+    # Of q and -q, which are the same rotation, the one with w >= 0 has its angle in [0, pi].
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, q[..., :1])
+    # 2 is the limit of angle / sine at zero, where the quotient is ill-conditioned.
     scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 2.0)
     return scale * q[..., 1:]
 

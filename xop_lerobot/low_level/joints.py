@@ -79,6 +79,7 @@ class RobotJoints:
         ids = model.actuator_trnid[:, 0]
         names = tuple(model.joint(joint).name for joint in ids)
         commands, arms = morphology.command_space.names, morphology.arm_names
+        # Entries of the command that are joint angles are named as their joints, less the suffix.
         bare = [name.removesuffix("_joint") for name in names]
         low, high = np.where(model.jnt_limited[ids], model.jnt_range[ids].T, [[-np.inf], [np.inf]])
         return cls(

@@ -128,6 +128,7 @@ class NetworkPolicy(LowLevelPolicy):
         self._stages = (stationary,) if mobile is stationary else (stationary, mobile)
         self._columns = FeatureColumns(joints)
         self._handover_s = table.handover_s
+        # Entries without a threshold are always below it.
         self._slow = np.full(len(joints.commands), np.inf)
         for entry, size in table.stands_below.items():
             self._slow[joints.find_command(entry)] = size
@@ -147,6 +148,7 @@ class NetworkPolicy(LowLevelPolicy):
 
     def adapt(self, model: mujoco.MjModel) -> None:
         """Set the motors of `model` to those that the policy was trained with."""
+        # MuJoCo's position servo has the gain k_p and the bias (0, -k_p, -k_d).
         for joint, name in enumerate(self._joints.names):
             index = model.actuator(name).id
             model.actuator_gainprm[index, 0] = self.motors.stiffness[joint]
@@ -276,6 +278,7 @@ class NetworkPolicy(LowLevelPolicy):
                 part = situation.choose(rows)
                 targets[rows], after[index][rows] = self._run(index, part, memories[index][rows])
         targets, handover = self._hand_over(active, targets, handover)
+        # The inactive network records the executed targets, converted to its own motors.
         for index, rows in enumerate(rows_of):
             if len(rows):
                 other = self._stages[1 - index]
@@ -292,6 +295,7 @@ class NetworkPolicy(LowLevelPolicy):
         nu = targets.shape[1]
         later = np.empty_like(handover)
         before, left = handover[:, 0], handover[:, 1]
+        # The difference is taken at the switch, from then on its share decays linearly.
         changes = (before >= 0) & (before != active) & (self._handover_s > 0)
         difference = np.where(
             changes[:, None], handover[:, 2 + nu :] - targets, handover[:, 2 : 2 + nu]

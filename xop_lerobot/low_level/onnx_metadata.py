@@ -93,6 +93,7 @@ def _read_mjlab(
         if [abs(float(bound)) for bound in clip.split(";")] != [float("inf")] * 2:
             raise ValueError(f"'observation_terms_clip' of {name} is {clip}, expected -inf;inf")
         factors = tuple(float(factor) for factor in scale.split(";"))
+        # A history length of 0 means the present frame alone, as 1 does.
         terms.append(_make_term(name, joints, factors, max(int(float(history)), 1)))
     network = d.Network(
         file=d.File(file.name),
@@ -110,6 +111,7 @@ def _read_mjlab(
         mobile="network",
         networks={"network": network},
         motors=d.Motors(by_joint("joint_stiffness"), by_joint("joint_damping")),
+        # No velocity in stationary mode, not even for a weight shift.
         ranges={"stationary": dict.fromkeys(VELOCITIES, (0.0, 0.0))},
     )
 

@@ -128,6 +128,7 @@ def _build(
     name: str, file: Path, table: d.PolicyTable, path: str | None, network: LoadedNetwork | None
 ) -> NetworkPolicy:
     joints = read_joints(table.robot)
+    # A network of both modes is loaded once: `NetworkPolicy` recognises it by identity.
     names = {table.stationary, table.mobile}
     parts = {part: _load_part(part, file, table, path, network) for part in names}
     return NetworkPolicy(name, table, joints, parts[table.stationary], parts[table.mobile])

@@ -239,7 +239,7 @@ class Morphology(ABC):
             BadValue: If a range of the policy does not overlap with the robot's.
         """
         fitted = copy.copy(self)
-        vars(fitted).pop("layout", None)
+        vars(fitted).pop("layout", None)  # cached with the old command space
         fitted.command_space = self.command_space.fit(
             policy.ranges, policy.dead_zones, policy.stop_rates
         )

@@ -112,6 +112,7 @@ class Simulation(Plant):
             seed: Seed of the noise; the same seed gives the same run. None takes the next one of
                 the configured seed's sequence, so that the episodes of a session differ.
         """
+        # The second number keeps given seeds apart from those of the session's sequence.
         entropy = (self.config.seed, 0, self._num_resets) if seed is None else (seed, 1)
         with self._lock:
             if seed is None:
@@ -355,7 +356,10 @@ class Simulation(Plant):
         self._diverged = self._has_fallen = True
 
     def _update_positions(self) -> None:
-        """Update positions of bodies, sites, cameras and lights to `qpos`."""
+        """Update positions of bodies, sites, cameras and lights to `qpos`.
+
+        `mj_step` leaves them at the configuration before its integration.
+        """
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)

@@ -117,10 +117,10 @@ class Watch:
             self._forget_place()
         velocity = (action.command - self._space.neutral)[self._velocities]
         if action.mode is Mode.STATIONARY:
-            told = np.abs(velocity) <= self._space.sway[self._velocities] + 1e-6
+            at_rest = np.abs(velocity) <= self._space.sway[self._velocities] + 1e-6
         else:
-            told = np.abs(velocity) <= STILL
-        if not told.all():
+            at_rest = np.abs(velocity) <= STILL
+        if not at_rest.all():
             self._forget_place()
             return False
         self._stood += POLICY_DT

@@ -134,6 +134,7 @@ class StampedPlan(NamedTuple):
 
     def has_run_out(self, time: float) -> bool:
         """Whether `time` is more than `GRACE_S` past the end of the plan."""
+        # A plan shorter than the control period has to last until the next one.
         length = max(len(self.plan.commands) * POLICY_DT, self.period)
         return time - self.time > length + GRACE_S
 

@@ -160,13 +160,14 @@ def add_grippers(
             name1=mirrored,
             name2=driven,
         )
-        equality.data[:5] = (0, -1, 0, 0, 0)
+        equality.data[:5] = (0, -1, 0, 0, 0)  # polynomial: mirrored = -driven
 
 
 def add_wheels(spec: mujoco.MjSpec) -> None:
     """Add the contacts with the floor: wheels with point contact, frictionless casters."""
     import mujoco  # noqa: PLC0415
 
+    # With priority, these geoms' friction counts instead of the floor's.
     floor_only = {"contype": 0, "conaffinity": FLOOR_BIT, "mass": 0, "priority": 1, "group": 3}
     for side in ("left", "right"):
         spec.body(f"wheel_{side[0]}").add_geom(
