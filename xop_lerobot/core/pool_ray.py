@@ -162,5 +162,5 @@ def _check_versions(machine: str, versions: str) -> None:
         named = ", ".join(f"{name} {theirs.get(name)} (here: {ours[name]})" for name in wrong)
         raise OtherVersions(
             f"machine '{machine}' of the Ray cluster has {named}. Install the same versions on all "
-            "machines: the same seeds shall give the same episodes"
+            "machines, so that the same seeds give the same episodes"
         )

@@ -73,8 +73,8 @@ class RobotJoints:
         if len(others):
             names = ", ".join(model.actuator(i).name for i in others)
             raise BadValue(
-                f"robot '{morphology.name}' has motors that turn no joint, which no table drives: "
-                f"{names}"
+                f"robot '{morphology.name}' has motors that are not on a joint, which a policy "
+                f"table can't drive: {names}"
             )
         ids = model.actuator_trnid[:, 0]
         names = tuple(model.joint(joint).name for joint in ids)

@@ -167,15 +167,15 @@ class TermReader:
                 which = term.phases
                 if max(which, default=0) >= self._num_phases:
                     raise BadValue(
-                        f"{describe(term)} shows phase {max(which)}, and the clock has "
-                        f"{self._num_phases}"
+                        f"{describe(term)} shows phase {max(which)}, but the clock has "
+                        f"{self._num_phases} phases"
                     )
             case d.Constant():
                 which = ()
         if isinstance(term, d.JointTargets):
             free = [joints.names[joint] for joint in chosen if not joints.is_commanded(joint)]
             if free:
-                raise BadValue(f"{describe(term)}: nothing commands {', '.join(free)}")
+                raise BadValue(f"{describe(term)}: no command or target for {', '.join(free)}")
         return self._columns.pick(name, which), chosen
 
 
@@ -214,7 +214,7 @@ def spread_over(
     """
     if isinstance(numbers, Mapping):
         if not chosen:
-            raise BadValue(f"{what} has no joints, so its scale can't go by their names")
+            raise BadValue(f"{what} has no joints, so its scale can't be given by joint")
         return joints.spread(numbers, 1.0)[list(chosen)]
     if isinstance(numbers, tuple) and len(numbers) != width:
         raise BadValue(f"{what} has {width} numbers, and its scale has {len(numbers)}")
