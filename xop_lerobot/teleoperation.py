@@ -29,7 +29,6 @@ from xop_lerobot.plant.watch import MOVES
 from xop_lerobot.retarget.changes import Change, Settings, make_toggle, parse_change
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs.collision import Obstacle
-from xop_lerobot.retarget.driver import RobotDriver
 from xop_lerobot.retarget.factory import (
     apply_settings,
     find_obstacles,
@@ -41,6 +40,7 @@ from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.online import AppliedChange, ModeSwitch, OnlineSettings
 from xop_lerobot.retarget.plan_follower import PlanFollower
 from xop_lerobot.retarget.sync.state_sync import StateSync, Synced
+from xop_lerobot.retarget.whole_body import WholeBodyController
 from xop_lerobot.session import RobotInfo, Tick
 
 
@@ -109,7 +109,7 @@ class Teleoperation:
         )
         self._sync = StateSync(self.morphology, model) if config.retargeter.sync else None
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
-        self._driver = RobotDriver(self.morphology, policy, self._follower, self.dt)
+        self._driver = WholeBodyController(self.morphology, policy, self._follower, self.dt)
         self._arms = self._driver.arms
         self._start_over()
 

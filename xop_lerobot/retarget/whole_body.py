@@ -17,7 +17,7 @@ RETREAT_RATE = 1.0
 """Speed at which arms return to their rest posture when the robot will not stand still [rad/s]."""
 
 
-class RobotDriver:
+class WholeBodyController:
     """Computes the actions that drive a robot or hold it in place.
 
     Per tick, `hold` or `drive` gives the desired action, `limit` the one that is executed.
