@@ -241,7 +241,7 @@ class Recorder:
 
     def record(self, index: int, name: str, ticks: int | None = None) -> None:
         """Record episode `index` of the kind `name`, or only its first `ticks`, unsaved."""
-        from xop_lerobot.recording.tick import run_tick
+        from xop_lerobot.recording.step import record_step
 
         rng = np.random.default_rng([self._seed, index])
         Crouch.push = KINDS[name].push
@@ -256,7 +256,7 @@ class Recorder:
         self.dataset.begin(events, ticks)
         try:
             while not events["exit_early"]:
-                run_tick(self.robot, teleop, self.dataset, Crouch.instruction)
+                record_step(self.robot, teleop, self.dataset, Crouch.instruction)
         finally:
             teleop.disconnect()
         if ticks is None:

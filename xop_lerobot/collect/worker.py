@@ -25,7 +25,7 @@ from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.host import own_loop
 from xop_lerobot.recording.lockstep import count_ticks
 from xop_lerobot.recording.record import build_features
-from xop_lerobot.recording.tick import run_tick
+from xop_lerobot.recording.step import record_step
 from xop_lerobot.session import TaskStatus, get_session
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ class Collector:
         dataset.begin(events, self.get_limit(job))
         frames = 0
         while not events["exit_early"]:
-            run_tick(self.robot, teleop, dataset, self.get_instruction(job, frames))
+            record_step(self.robot, teleop, dataset, self.get_instruction(job, frames))
             frames += 1
             outcome = self._outcome
             if outcome is not None and outcome.done:

@@ -52,7 +52,7 @@ from xop_lerobot.recording.dataset import XopDataset
 from xop_lerobot.recording.host import own_loop
 from xop_lerobot.recording.lockstep import count_ticks
 from xop_lerobot.recording.opening import check_storage
-from xop_lerobot.recording.tick import run_tick
+from xop_lerobot.recording.step import record_step
 
 if TYPE_CHECKING:
     from lerobot_robot_xop.xop_robot import XopRobot
@@ -118,17 +118,17 @@ class Recording:
         start = time.perf_counter()
         while not self.events["exit_early"]:
             tick_start = time.perf_counter()
-            self.run_tick()
+            self.record_step()
             if self.realtime or config.pace:
                 precise_sleep(max(0.0, tick_start + 1 / fps - time.perf_counter()))
             if self.realtime and time.perf_counter() - start >= duration:
                 break
         self.events["exit_early"] = False
 
-    def run_tick(self) -> None:
+    def record_step(self) -> None:
         """Observe, decide, act, record."""
         config = self.config
-        observation, action = run_tick(
+        observation, action = record_step(
             self.robot, self.teleop, self.dataset, config.dataset.single_task
         )
         if config.display_data:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from xop_lerobot.recording.dataset import XopDataset
 
 
-def run_tick(
+def record_step(
     robot: XopRobot, teleop: Xop, dataset: XopDataset, task: str
 ) -> tuple[dict[str, Any], dict[str, float]]:
     """Run one tick and add its frame to the dataset.
