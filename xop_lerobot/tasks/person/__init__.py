@@ -1,1 +1,1 @@
-"""A simulated person in the headset: delayed, noisy perception, human motion, corrections."""
+"""Simulated headset operator: delayed and noisy perception, human motion, corrections."""

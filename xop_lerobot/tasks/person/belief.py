@@ -14,19 +14,19 @@ from xop_lerobot.core.transforms import (
 
 
 class Belief:
-    r"""The person acts as though the robot's body were the own one.
+    r"""Estimate of where the person's body is in the robot's world, which it takes for its own.
 
-    Believed is a turn :math:`\psi` and an offset o of the floors, and that heights and reaches go
-    by the ratio s of the eyes' heights, as they looked when the person put the headset on:
+    The estimate is a yaw :math:`\psi`, a floor offset o and a vertical offset :math:`z_0`. Heights
+    and reaches scale by s, the ratio of eye heights when the person put the headset on:
 
     .. math:: p^{robot}_{xy} = o + R(\psi)\,p^{own}_{xy},\qquad z^{robot} = z_0 + s\,z^{own}
 
-    Where the robot is not where the own body says, the belief is changed; so the next movement
-    starts from where the robot is.
+    `learn` corrects it towards what is seen, so that the next movement starts from where the robot
+    really is.
 
     Args:
-        own: Own head. Shape (7,).
-        robot: The robot's head, as seen. Shape (7,).
+        own: The person's head, in the room. Shape (7,).
+        robot: The robot's head as seen, in the robot's world. Shape (7,).
     """
 
     def __init__(self, own: np.ndarray, robot: np.ndarray) -> None:
@@ -36,12 +36,12 @@ class Belief:
         self._offset = robot[:2] - self._rotate(own[:2])
 
     def learn(self, own: np.ndarray, robot: np.ndarray, gain: float) -> None:
-        """Take in where the robot's head is seen, and where the own one is. Shapes (7,).
+        """Correct yaw and offsets by a share of the seen difference.
 
         Args:
-            own: Own head.
-            robot: The robot's head.
-            gain: Share of the difference that is believed.
+            own: The person's head, in the room. Shape (7,).
+            robot: The robot's head as seen, in the robot's world. Shape (7,).
+            gain: Share of the difference that is corrected [1].
         """
         turn = compute_heading(robot[3:]) - compute_heading(own[3:])
         self.turn = float(wrap_angle(self.turn + gain * wrap_angle(turn - self.turn)))
@@ -49,24 +49,29 @@ class Belief:
         self._lift += gain * (float(robot[2]) - self.scale * float(own[2]) - self._lift)
 
     def place_to_own(self, place: np.ndarray) -> np.ndarray:
-        """Place and heading on the floor, x y yaw, of the robot's world in the own room."""
+        """Map x y yaw [m, m, rad] on the floor from the robot's world into the room. Shape (3,)."""
         xy = self._rotate(place[:2] - self._offset, back=True)
         return np.array([*xy, float(wrap_angle(place[2] - self.turn))])
 
     def height_to_own(self, height: float) -> float:
-        """Own head's height for one of the robot's [m]."""
+        """Map a head height from the robot's world into the room [m]."""
         return (height - self._lift) / self.scale
 
     def vector_to_own(self, vector: np.ndarray) -> np.ndarray:
-        """A reach in the robot's world as one of the own arm. Shape (3,)."""
+        """Map a reach from the robot's world into the room. Shape (3,)."""
         return quat_rotate(quat_from_yaw(-self.turn), vector) / self.scale
 
     def quat_to_own(self, quat: np.ndarray) -> np.ndarray:
-        """An orientation in the robot's world, in the own room. Shape (4,)."""
+        """Map an orientation from the robot's world into the room, wxyz. Shape (4,)."""
         return quat_multiply(quat_from_yaw(-self.turn), quat)
 
     def point_to_robot(self, point: np.ndarray, own_head: np.ndarray) -> np.ndarray:
-        """Where the robot's counterpart of a point of the own body is believed to be. (3,)."""
+        """Map a point of the person's body to the robot's world. Shape (3,).
+
+        Args:
+            point: In the room [m]. Shape (3,).
+            own_head: The person's head, in the room. Shape (7,).
+        """
         head = np.array(
             [*(self._offset + self._rotate(own_head[:2])), self._lift + self.scale * own_head[2]]
         )
@@ -74,7 +79,7 @@ class Belief:
         return head + quat_rotate(quat_from_yaw(self.turn), reach)
 
     def point_to_own(self, point: np.ndarray, own_head: np.ndarray) -> np.ndarray:
-        """Inverse of `point_to_robot`. Shape (3,)."""
+        """Map a robot world point into the room; inverse of `point_to_robot`. Shape (3,)."""
         head = self.point_to_robot(own_head[:3], own_head)
         return own_head[:3] + self.vector_to_own(point - head)
 

@@ -1,4 +1,4 @@
-"""The person's own body in the own room: where it stands, how it bends, where the hands are."""
+"""The person's own body in its room: standing place, posture, hands, and human motion."""
 
 from __future__ import annotations
 
@@ -25,41 +25,41 @@ from xop_lerobot.tasks.person.person import Person
 
 SIDES: tuple[str, str] = ("left", "right")
 OPEN, SHUT = 0.08, 0.008
-"""Distance of thumb and index tip of an open hand, and in a pinch [m]."""
+"""Distance between thumb and index tip of an open hand, and in a pinch [m]."""
 PINCHES = ((0.0, 0.25), (0.45, 0.70))
-"""Beginning and end of the two pinches of a double pinch [s]."""
+"""Start and end of each pinch in a double pinch [s]."""
 PINCH_RAMP = 0.09
-"""Time in which thumb and index close, and open [s]."""
+"""Time for thumb and index to close, and to open [s]."""
 DOUBLE_PINCH_S = 0.75
-"""Length of a double pinch [s]."""
+"""Duration of a double pinch [s]."""
 HALT_S = 0.7
-"""Time in which a walk or a turn that is broken off comes to rest [s]."""
+"""Time in which an interrupted walk or turn comes to rest [s]."""
 RELAXED = (0.30, 0.22, -0.50)
-"""Left hand held in front: from the head, forward, left, up [m], for eyes at 1.6 m."""
+"""Left wrist held in front, relative to the head: forward, left, up, for eyes at 1.6 m [m]."""
 STEP_HZ = 1.6
-"""Steps in a second of slow walking."""
+"""Step frequency of slow walking [Hz]."""
 BOB = (0.010, 0.012)
-"""Amplitude of the head up and down, and sideways, at 0.6 m/s [m]."""
+"""Amplitude of the head's vertical and lateral motion at 0.6 m/s [m]."""
 NECK = 0.45
-"""How far the eyes go forward with a nod, of trunk and neck in equal parts [m/rad]."""
+"""Forward motion of the eyes per nod; trunk and neck share the nod equally [m/rad]."""
 TRUNK = 0.50
-"""Over what length a bend of the trunk lowers the eyes [m], for eyes at 1.6 m."""
+"""Radius of the arc on which bending the trunk lowers the eyes, for eyes at 1.6 m [m]."""
 HIPS_BACK = 0.20
-"""How far the hips go back under a trunk that bends, to keep the balance [m/rad]."""
+"""Backward motion of the hips under a bending trunk, which keeps the balance [m/rad]."""
 
 
 @dataclass(frozen=True)
 class Posture:
-    """One posture of the body.
+    """Posture of the body, in the person's room.
 
     Attributes:
-        place: Where the person stands in the own room, and the heading, x y yaw. Shape (3,).
-        drop: How far the eyes are lowered by the knees [m].
-        lean: How far the head is moved ahead and to the left of where the person stands [m].
-            Shape (2,).
-        look: Turn of the head to the left and down, against the body [rad]. Shape (2,).
-        hands: Wrists, left and right, from the head along the body's heading. Shape (2, 7).
-        bend: How far the trunk is bent forward at the hips; `look` has it, too [rad].
+        place: Standing place and heading, x y yaw [m, m, rad]. Shape (3,).
+        drop: Lowering of the eyes by the knees [m].
+        lean: Offset of the head ahead and to the left of the standing place [m]. Shape (2,).
+        look: Yaw to the left and pitch down of the head, relative to the body [rad]. Shape (2,).
+        hands: Left and right wrist, relative to the head position with the body's heading. Shape
+            (2, 7).
+        bend: Forward bend of the trunk at the hips, also contained in `look` [rad].
     """
 
     place: np.ndarray
@@ -70,7 +70,7 @@ class Posture:
     bend: float = 0.0
 
     def compute_frame(self, eye_height: float) -> np.ndarray:
-        """Place of the head with the heading of the body, without turn and nod. Shape (7,)."""
+        """Position of the head with the body's heading, without turn and nod. Shape (7,)."""
         turn = quat_from_yaw(self.place[2])
         ahead = self.lean[0] + NECK * np.sin(self.look[1]) - HIPS_BACK * np.sin(self.bend)
         lean = np.array([ahead, self.lean[1], 0])
@@ -80,12 +80,12 @@ class Posture:
 
 
 def compute_sinking(bend: float, eye_height: float) -> float:
-    """How far a bend of the trunk [rad] lowers the eyes [m]."""
+    """Compute how far bending the trunk by `bend` [rad] lowers the eyes [m]."""
     return TRUNK * eye_height / Person.eye_height * (1 - float(np.cos(bend)))
 
 
 def relaxed_hands(scale: float = 1.0) -> np.ndarray:
-    """Both hands held in front, palms inwards and fingers forward. Shape (2, 7)."""
+    """Return both hands held in front, palms inwards, fingers forward. Shape (2, 7)."""
     return np.array(
         [
             make_pose(
@@ -97,17 +97,17 @@ def relaxed_hands(scale: float = 1.0) -> np.ndarray:
 
 
 def stand_upright(posture: Posture, hands: np.ndarray | None = None) -> Posture:
-    """The same without squat, lean, bend and nod; with other hands, where some are given."""
+    """Return the posture without squat, lean, bend and nod, optionally with other hands."""
     hands = posture.hands if hands is None else hands
     return Posture(posture.place, 0.0, np.zeros(2), np.zeros(2), hands)
 
 
 class Body:
-    """Moves from posture to posture as people move.
+    """Moves from posture to posture as people do.
 
-    Reaches and bends are of minimum jerk, all parts begin and end together. Walking starts and
-    stops smoothly and is even in between; the head bobs with the steps. Sway and tremor never
-    cease. The hands go along with the body unless they are told to stay in the room.
+    Reaches and bends are minimum-jerk, with all parts starting and ending together. Walking has
+    smooth starts and stops and constant speed in between; the head bobs with the steps. Sway and
+    tremor are always present. Hands move with the body unless told to stay in the room.
 
     Args:
         person: Height and speeds.
@@ -137,32 +137,32 @@ class Body:
         return any(self.time < at + DOUBLE_PINCH_S for at in self._pinched_at.values())
 
     def hold(self, hands: np.ndarray) -> None:
-        """Hold the hands so, before anybody looks. Shape (2, 7)."""
+        """Set the wrists without a movement, before the session starts. Shape (2, 7)."""
         self.posture = self._start = self._end = replace(self.posture, hands=hands)
 
     def move(self, end: Posture, duration: float) -> None:
-        """Begin to go to `end` with minimum jerk, in `duration` [s]."""
+        """Start a minimum-jerk movement to `end` that takes `duration` [s]."""
         self._begin(end, duration, 0.0)
 
     def walk(self, end: Posture, pace: float = 1.0) -> None:
-        """Begin to walk straight to `end`, evenly but for the start and the stop.
+        """Start walking straight to `end`, at constant speed except for start and stop.
 
-        Headings count as they are, so a turn may be more than half a circle.
+        Headings are not wrapped, so a turn may exceed half a circle.
 
         Args:
-            end: Where to.
-            pace: Factor on the speed.
+            end: Posture at the destination.
+            pace: Factor on the speed [1].
         """
-        way = float(np.linalg.norm(end.place[:2] - self.posture.place[:2]))
+        distance = float(np.linalg.norm(end.place[:2] - self.posture.place[:2]))
         turn = abs(float(end.place[2] - self.posture.place[2]))
         person = self._person
-        # Half of the way of each ramp is lost against even speed.
-        even = max(way / person.walk_speed, turn / person.turn_speed)
+        # Each ramp covers half the distance of constant speed, so the two cost one ramp more.
+        even = max(distance / person.walk_speed, turn / person.turn_speed)
         start = person.walk_start / pace
         self._begin(end, even / pace + start, start)
 
     def halt(self) -> None:
-        """Break a walk or turn off, and come to rest within `HALT_S`."""
+        """Interrupt a walk or turn and come to rest within `HALT_S`."""
         if not self.is_moving:
             return
         later = self._compute_posture(self.time + 0.01)
@@ -172,12 +172,12 @@ class Body:
         self._braking = True
 
     def double_pinch(self, *sides: str) -> None:
-        """Begin to pinch twice with thumb and index of the hands named."""
+        """Start a double pinch with thumb and index of the named hands."""
         for side in sides:
             self._pinched_at[side] = self.time
 
     def advance(self, time: float) -> None:
-        """Go on to `time` [s] of the person's clock."""
+        """Advance to `time` [s] of the person's clock."""
         dt, self.time = time - self.time, time
         last = self.posture.place[:2]
         self.posture = self._compute_posture(time)
@@ -188,12 +188,12 @@ class Body:
             self._speed += share * (step / dt - self._speed)
 
     def compute_hands_in_room(self, posture: Posture | None = None) -> np.ndarray:
-        """Wrists in the own room, without sway. Shape (2, 7)."""
+        """Compute the wrists in the room, without sway. Shape (2, 7)."""
         posture = posture or self.posture
         return pose_multiply(posture.compute_frame(self._person.eye_height), posture.hands)
 
     def with_hands_in_room(self, posture: Posture, hands: Mapping[str, np.ndarray]) -> Posture:
-        """The posture with hands at these places in the own room, and the others as they are."""
+        """Return the posture with the given hands at these poses of the room. Shapes (7,)."""
         frame = pose_inverse(posture.compute_frame(self._person.eye_height))
         wrists = posture.hands.copy()
         for side, pose in hands.items():
@@ -201,13 +201,13 @@ class Body:
         return replace(posture, hands=wrists)
 
     def compute_head(self) -> np.ndarray:
-        """Pose of the head in the own room, without sway. Shape (7,)."""
+        """Compute the head pose in the room, without sway. Shape (7,)."""
         frame = self.posture.compute_frame(self._person.eye_height)
         nod = quat_from_rpy(0, float(self.posture.look[1]), float(self.posture.look[0]))
         return make_pose(frame[:3], quat_multiply(frame[3:], nod))
 
     def make_frame(self, time: float) -> OperatorFrame:
-        """What a headset would stream now, stamped `time`."""
+        """Return what a headset would stream now, stamped `time` [s]."""
         frame = self.posture.compute_frame(self._person.eye_height)
         head, hands = self.compute_head(), pose_multiply(frame, self.posture.hands)
         sway, turn = self._noise.at(self.time), frame[3:]
@@ -238,14 +238,14 @@ class Body:
         if u >= 1:
             return self._end
         if self._braking:
-            way = 2 * u - 2 * u**3 + u**4  # from even speed to rest
+            share = 2 * u - 2 * u**3 + u**4  # quartic from constant speed to rest
         elif self._ramp:
-            way = _compute_ramped(u, self._ramp / self._duration)
+            share = _compute_ramped(u, self._ramp / self._duration)
         else:
-            way = compute_minimum_jerk(u)
+            share = compute_minimum_jerk(u)
         u = compute_minimum_jerk(u)
         start, end = self._start, self._end
-        place = start.place + way * (end.place - start.place)
+        place = start.place + share * (end.place - start.place)
         return Posture(
             place=place,
             drop=start.drop + u * (end.drop - start.drop),
@@ -256,7 +256,7 @@ class Body:
         )
 
     def _compute_bob(self) -> np.ndarray:
-        """The head's way up and down, and to the sides, in walking. Shape (3,)."""
+        """Vertical and lateral motion of the head while walking, world axes [m]. Shape (3,)."""
         size = min(self._speed / 0.6, 1.0) * self._noise.scale
         phase = 2 * np.pi * STEP_HZ * self.time
         return size * np.array([0, BOB[1] * np.sin(phase / 2), BOB[0] * np.sin(phase)])
@@ -272,9 +272,10 @@ class Body:
 
 
 def _compute_ramped(u: float, ramp: float) -> float:
-    """Share of the way at share u of the time: even speed, with smooth start and stop.
+    """Share of the distance covered at share u of the time.
 
-    The speed rises over the first `ramp` of the time as a smoothstep, and falls over the last.
+    The speed rises as a smoothstep over the first `ramp` of the time, is constant, and falls as a
+    smoothstep over the last `ramp`.
     """
     ramp = min(ramp, 0.5)
 
@@ -282,9 +283,9 @@ def _compute_ramped(u: float, ramp: float) -> float:
         return x**3 - 0.5 * x**4
 
     if u < ramp:
-        way = ramp * rise(u / ramp)
+        covered = ramp * rise(u / ramp)
     elif u <= 1 - ramp:
-        way = 0.5 * ramp + (u - ramp)
+        covered = 0.5 * ramp + (u - ramp)
     else:
-        way = (1 - ramp) - ramp * rise((1 - u) / ramp)
-    return way / (1 - ramp)
+        covered = (1 - ramp) - ramp * rise((1 - u) / ramp)
+    return covered / (1 - ramp)

@@ -1,4 +1,4 @@
-"""Carry a box: squeeze it between both palms, lift it, walk to the table, put it down."""
+"""Intention that carries a box: squeeze it between both palms, lift, walk to the table, place."""
 
 from __future__ import annotations
 
@@ -44,49 +44,49 @@ from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 from xop_lerobot.tasks.person.walking import compute_miss, find, glance, go_to, set_mode
 
 PRESS_MORE = 0.01
-"""How much more they press after a box has slipped [m]."""
+"""Increase of the press depth after each slip [m]."""
 APPROACHES = 4
-"""How often a person walks up to the box before giving up."""
-FARTHER = 0.055
-"""So much farther than for a touch the person stands from a box, to have elbows and waist free [m,
+"""Number of approaches to the box before giving up."""
+BOX_STANDOFF = 0.055
+"""Additional distance to the box compared with a touch, which keeps elbows and waist free [m,
 robot]."""
-APART = 0.12
-"""So much farther apart than else the hands are when one walks up to a box [m]. They are drawn in,
-too, as far as the robot's arms allow, not to sweep it off its support in a turn."""
-STAND_NEAR = 0.04
-"""How far beside where it wants to stand before the box is good enough [m]."""
-BEND_NEAR = 0.05
-"""How much too far a box may be for who bends [m]."""
+HANDS_APART = 0.12
+"""Additional distance of each hand from the middle while walking up to the box [m]. Hands are
+also drawn in, as far as the robot's arms allow, so that a turn does not sweep the box off its
+support."""
+STAND_TOLERANCE = 0.04
+"""Accepted error of the standing place in front of the box [m]."""
+BEND_TOLERANCE = 0.05
+"""Accepted excess of the distance to the box for a bent trunk [m]."""
 GRASPS = 4
-"""How often a person takes hold anew before giving up."""
+"""Number of grasps before giving up."""
 HOLD_S = 3.6
-"""How long the lifted box is held [s]."""
-FIRMER = 0.02
-"""How much further in hands are that hold a box while walking [m]."""
+"""Time the lifted box is held; the task asks for 3 s [s]."""
+WALK_PRESS = 0.02
+"""Additional inward offset of each hand's goal while walking with the box [m]."""
 STRAIGHTEN_S = 2.5
-"""Time to stand up straight with a box [s]."""
-BACK = 0.35
-"""How far the person steps back from the support [m]."""
-WALK_NEAR = 0.06
-"""How far beside its spot the box may be when one has walked there; the hands do the rest [m]."""
-PLACE_NEAR = 0.04
-"""How far beside the spot the box may be put down [m]."""
+"""Shortest time to stand up with the box [s]."""
+STEP_BACK = 0.35
+"""Distance of the step back from the support [m]."""
+WALK_TOLERANCE = 0.06
+"""Accepted distance of the box from its spot after walking; the hands do the rest [m]."""
+PLACE_TOLERANCE = 0.04
+"""Accepted distance of the box from the spot when it is put down [m]."""
 OPENINGS, DONE_S = 3, 2.5
-"""How often a person takes the hands farther off a box, and how long they look whether it counts
-[s]."""
-OVER, WELL_OVER = 0.015, 0.06
-"""Height of a box over the table from which one carries it there, and to which one brings it in
+"""Number of times the hands are moved farther off the box, and time to look for success [s]."""
+TABLE_CLEARANCE, RISE_CLEARANCE = 0.015, 0.06
+"""Height of the box above the table needed to carry it there, and the height aimed for while
 standing up with it [m]."""
-LOWERINGS, BY_KNEES, KNEES_SPEED = 6, 0.03, 0.08
-"""How often a person lowers a box before letting it go anyway, from what height on it bends the
-knees for it [m], and how fast [m/s]."""
-LEVEL, LEVELLINGS, TIP_SPEED = 0.08, 3, 0.15
-"""Tilt at which a box is level enough to be put down [rad], how often a person tips it, and how
-fast [rad/s]."""
+LOWERINGS, KNEES_ABOVE, KNEES_SPEED = 6, 0.03, 0.08
+"""Number of lowering movements before letting go anyway; height from which the knees are bent [m],
+and the speed of that [m/s]."""
+LEVEL_TILT, LEVELLINGS, TIP_SPEED = 0.08, 3, 0.15
+"""Tilt up to which the box can be put down [rad], number of levelling movements, and their turn
+rate [rad/s]."""
 
 
 def carry_box(mind: Mind) -> Doing:
-    """Take the box from its support to the spot on the table; who loses it takes it again."""
+    """Carry the box from its support to the spot on the table; grasp it again if it slips."""
     yield from find(mind, "box")
     for attempt in range(APPROACHES):
         try:
@@ -104,7 +104,7 @@ def carry_box(mind: Mind) -> Doing:
 
 
 def choose_heading(mind: Mind, name: str) -> float:
-    """Heading that faces a side of a thing squarely: the side that one comes upon [rad]."""
+    """Heading that squarely faces the side of an object nearest to the line of approach [rad]."""
     pose, head = mind.eyes.pose(name), mind.eyes.pose("head")
     course = float(np.arctan2(*(pose[:2] - head[:2])[::-1]))
     yaw = float(quat_yaw(pose[3:]))
@@ -113,32 +113,35 @@ def choose_heading(mind: Mind, name: str) -> float:
 
 
 def walk_to_box(mind: Mind) -> Doing:
-    """Stand before the box, squarely."""
+    """Walk to stand squarely in front of the box."""
     heading = choose_heading(mind, "box")
     box = mind.eyes.pose("box")[:3]
     ahead = compute_ahead(heading)
-    distance = compute_distance(mind, [box], FARTHER)
+    distance = compute_distance(mind, [box], BOX_STANDOFF)
     place = np.array([*(box - distance * ahead)[:2], heading])
     miss, turn = compute_miss(mind, place)
-    if miss > STAND_NEAR or abs(turn) > mind.person.heading_tolerance:
+    if miss > STAND_TOLERANCE or abs(turn) > mind.person.heading_tolerance:
         yield from set_mode(mind, Mode.MOBILE)
         yield from glance(mind, "spot")
         hands = relaxed_hands(mind.person.size)
-        hands[:, 1] += [APART, -APART]
+        hands[:, 1] += [HANDS_APART, -HANDS_APART]
         hands[:, 0] -= mind.eyes.recall("draw_in", 0.0) / mind.belief.scale
-        yield from go_to(mind, place, hands=hands, tolerance=STAND_NEAR)
+        yield from go_to(mind, place, hands=hands, tolerance=STAND_TOLERANCE)
     yield from set_mode(mind, Mode.STATIONARY)
 
 
 def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
-    """Take hold of the box, lift it and hold it; who fails presses harder.
+    """Grasp, lift and hold the box, pressing harder after each failure.
 
     Args:
-        mind: Who does.
-        harder: How much more than is known to be enough the hands press [m].
+        mind: The person.
+        harder: Press depth beyond what the task's hint asks for [m].
+
+    Raises:
+        GaveUp: After `GRASPS` failures.
     """
     box = mind.eyes.pose("box")[:3]
-    yield from take_posture(mind, plan_posture(mind, [box], FARTHER))
+    yield from take_posture(mind, plan_posture(mind, [box], BOX_STANDOFF))
     yield from keep_distance(mind)
     press = mind.eyes.recall("press", PRESS)
     for attempt in range(GRASPS):
@@ -156,31 +159,31 @@ def pick_up(mind: Mind, harder: float = 0.0) -> Doing:
 
 
 def keep_distance(mind: Mind) -> Doing:
-    """Lean back, or ahead, to have the box at the distance at which arms work well.
+    """Lean back or ahead to bring the box to the comfortable working distance.
 
     Raises:
-        OutOfReach: If it is too far for who bends, whom a lean does not bring any farther.
+        OutOfReach: If it is too far for a bent trunk, which cannot lean.
     """
     head, box = mind.eyes.pose("head"), mind.eyes.pose("box")
     ahead = compute_ahead(float(compute_heading(head[3:])))
-    error = float((box - head)[:3] @ ahead) - compute_reach(mind) - FARTHER
-    error += compute_draw(mind, [box[:3]], FARTHER)
+    error = float((box - head)[:3] @ ahead) - compute_reach(mind) - BOX_STANDOFF
+    error += compute_draw(mind, [box[:3]], BOX_STANDOFF)
     mind.note(f"box {100 * error:.0f} cm too far")
     if mind.body.posture.bend:
-        if error > BEND_NEAR:
+        if error > BEND_TOLERANCE:
             raise OutOfReach
-    elif abs(error) > 0.5 * STAND_NEAR:
+    elif abs(error) > 0.5 * STAND_TOLERANCE:
         yield from lean(mind, {"both": error * ahead})
 
 
 def walk_to_table(mind: Mind) -> Doing:
-    """Step back, turn to the table and walk up to it, the box before oneself."""
+    """Step back, turn to the table and walk up to it with the box held in front."""
     yield from straighten_up(mind)
     hands = mind.body.posture.hands
     yield from set_mode(mind, Mode.MOBILE)
     head = mind.eyes.pose("head")
     heading = float(compute_heading(head[3:]))
-    back = np.array([*(head[:3] - BACK * compute_ahead(heading))[:2], heading])
+    back = np.array([*(head[:3] - STEP_BACK * compute_ahead(heading))[:2], heading])
     yield from go_to(mind, back, hands=hands, laden=True, tolerance=0.15, tries=2)
     yield from find(mind, "spot")
     yield from lift_over_table(mind)
@@ -189,20 +192,20 @@ def walk_to_table(mind: Mind) -> Doing:
         heading = choose_heading(mind, "spot")
         place = compute_carry_place(mind, heading)
         miss, _ = compute_miss(mind, place)
-        if miss <= WALK_NEAR:
+        if miss <= WALK_TOLERANCE:
             break
-        yield from go_to(mind, place, hands=hands, laden=True, tolerance=WALK_NEAR, tries=3)
+        yield from go_to(mind, place, hands=hands, laden=True, tolerance=WALK_TOLERANCE, tries=3)
     yield from set_mode(mind, Mode.STATIONARY)
 
 
 def straighten_up(mind: Mind) -> Doing:
-    """Stand upright with the box before oneself, and hold it more firmly, before walking."""
+    """Stand upright with the box held in front, and squeeze it more firmly for walking."""
     body, last = mind.body, mind.body.posture
     room = body.compute_hands_in_room()
     across = room[0][:3] - room[1][:3]
     across /= np.linalg.norm(across)
     for i in range(2):
-        room[i][:3] -= (1 - 2 * i) * FIRMER / mind.belief.scale * across
+        room[i][:3] -= (1 - 2 * i) * WALK_PRESS / mind.belief.scale * across
     end = body.with_hands_in_room(stand_upright(last), dict(zip(SIDES, room, strict=True)))
     if last.bend:
         end = replace(end, hands=bring_up(mind, end.hands))
@@ -212,18 +215,18 @@ def straighten_up(mind: Mind) -> Doing:
 
 
 def bring_up(mind: Mind, hands: np.ndarray) -> np.ndarray:
-    """Hands that would hang far down, once one stands, at a good height and distance instead.
+    """Raise and draw in hands that would hang low after standing up.
 
-    A good height is well over the table, if that was seen.
+    The goal height is above the table by `RISE_CLEARANCE`, if the table was seen.
 
     Args:
-        mind: Who stands up.
-        hands: Wrists, from the head along the body's heading. Shape (2, 7).
+        mind: The person.
+        hands: Wrists relative to the head, along the body's heading. Shape (2, 7).
     """
-    ahead = (compute_reach(mind) + FARTHER) / mind.belief.scale - HAND
+    ahead = (compute_reach(mind) + BOX_STANDOFF) / mind.belief.scale - HAND
     height = -mind.person.reach_low * mind.person.size
     if mind.eyes.knows("spot"):
-        middle = float(mind.eyes.pose("spot")[2] + mind.eyes.size("box")[2]) + WELL_OVER
+        middle = float(mind.eyes.pose("spot")[2] + mind.eyes.size("box")[2]) + RISE_CLEARANCE
         height = max(height, mind.belief.height_to_own(middle) - mind.person.eye_height)
     good = np.array([ahead, 0.0, height])
     way = good - hands[:, :3].mean(axis=0)
@@ -233,8 +236,8 @@ def bring_up(mind: Mind, hands: np.ndarray) -> np.ndarray:
 
 
 def lift_over_table(mind: Mind) -> Doing:
-    """Lift the box, if it is not well over the table that it goes to."""
-    lack = OVER - compute_height_over_spot(mind)
+    """Lift the box if it is not clear of the table."""
+    lack = TABLE_CLEARANCE - compute_height_over_spot(mind)
     if lack > 0:
         mind.note(f"lift it over the table by {100 * lack:.0f} cm")
         yield from shift_hands(mind, np.array([0, 0, lack]), CARRY_SPEED)
@@ -242,7 +245,7 @@ def lift_over_table(mind: Mind) -> Doing:
 
 
 def compute_carry_place(mind: Mind, heading: float) -> np.ndarray:
-    """Where to stand so that the box that one holds is over the spot, x y yaw. Shape (3,)."""
+    """Standing place that puts the held box over the spot, x y yaw. Shape (3,)."""
     head, box = mind.eyes.pose("head"), mind.eyes.pose("box")
     now = compute_heading(head[3:])
     offset = quat_rotate(
@@ -255,12 +258,12 @@ def compute_carry_place(mind: Mind, heading: float) -> np.ndarray:
 
 
 def put_down(mind: Mind) -> Doing:
-    """Bring the box over the spot, lower it until it stands, let go, take the hands away."""
+    """Bring the box over the spot, lower it until it stands, let go, and withdraw the hands."""
     for _ in range(4):
         yield from mind.settle("left_palm", "right_palm")
         check_held(mind)
         error = compute_way_to_spot(mind)
-        if np.linalg.norm(error) <= PLACE_NEAR:
+        if np.linalg.norm(error) <= PLACE_TOLERANCE:
             break
         yield from shift_hands(mind, mind.person.hand_gain * error, CARRY_SPEED)
     yield from level(mind)
@@ -271,10 +274,10 @@ def put_down(mind: Mind) -> Doing:
         mind.note(f"box {100 * height:.1f} cm over the table")
         if height < 0.012:
             break
-        if height > BY_KNEES:
+        if height > KNEES_ABOVE:
             yield from bend_knees(mind, height)
             continue
-        # Arms that go down draw nearer, too.
+        # Lowering arms also draws the box nearer, so the horizontal error is corrected again.
         way = mind.person.hand_gain * compute_way_to_spot(mind)
         way[2] = -height - 0.01
         yield from shift_hands(mind, way, CARRY_SPEED)
@@ -290,7 +293,7 @@ def put_down(mind: Mind) -> Doing:
 
 
 def bend_knees(mind: Mind, way: float) -> Doing:
-    """Go down with all that one holds, by so much of the robot's height [m]."""
+    """Lower the whole body, and the trunk if the knees do not suffice, by `way` [m, robot]."""
     last = mind.body.posture
     way /= mind.belief.scale
     drop = min(last.drop + way, mind.person.leg_bend)
@@ -304,7 +307,7 @@ def bend_knees(mind: Mind, way: float) -> Doing:
 
 
 def compute_way_to_spot(mind: Mind) -> np.ndarray:
-    """Way of the box to above its spot, level [m]. Shape (3,)."""
+    """Horizontal vector from the box to its spot [m]. Shape (3,)."""
     way = (mind.eyes.pose("spot") - mind.eyes.pose("box"))[:3]
     way[2] = 0
     mind.note(f"box {100 * float(np.linalg.norm(way)):.1f} cm beside the spot")
@@ -320,12 +323,12 @@ def level(mind: Mind) -> Doing:
         ahead = compute_ahead(float(compute_heading(mind.eyes.pose("head")[3:])))
         tilt = float(np.arcsin(up @ ahead))
         mind.note(f"box tilted by {np.degrees(tilt):.0f}°")
-        if abs(tilt) < LEVEL:
+        if abs(tilt) < LEVEL_TILT:
             return
         yield from tip_hands(mind, -tilt, TIP_SPEED)
 
 
 def compute_height_over_spot(mind: Mind) -> float:
-    """Height of the box's lower side over the table [m]."""
+    """Height of the box's lower side above the table [m]."""
     size = float(mind.eyes.size("box")[2])
     return float(mind.eyes.pose("box")[2] - mind.eyes.pose("spot")[2]) - size

@@ -1,4 +1,4 @@
-"""Device of a simulated person who sees the robot and performs its task."""
+"""Device of a simulated person, who watches the robot and performs its task."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ from xop_lerobot.tasks.person.intentions import INTENTIONS, PREPARATIONS
 from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 
 LINGER = 1.5
-"""Time for which the person stays after the end [s]."""
+"""Time the person stays after the task is done or given up [s]."""
 
 
 class SimulatedDevice(Device):
-    """A person with the parameters of `Person`; the same seed is the same person.
+    """A person with the parameters of `Person`; equal seeds give equal persons.
 
-    The person begins when engaged, with the task that is shown. It knows what `see` showed it
-    and nothing else.
+    The person starts the displayed task when engaged. All it knows is what `see` has shown it.
 
     Args:
-        config: Its settings: `seed`, `noise` and the mode at the start.
+        config: Device settings: `seed`, `noise` and `start_mode`.
     """
 
     self_engaging = True
@@ -40,22 +39,22 @@ class SimulatedDevice(Device):
         self._over_at: float | None = None
 
     def begin_episode(self, index: int) -> None:
-        """Be the person of episode `index`, however many there were before."""
+        """Become the person of episode `index`, independent of earlier episodes."""
         self._attempt = index
         self._begin()
 
     def start(self, time: float) -> None:
-        """Begin with the task, at `time` [s] of the robot's clock; after a reset, once more."""
+        """Start the task at `time` [s] of the robot's clock; a second start is a new attempt."""
         if self._started_at is not None:
             self._attempt += 1
             self._begin()
         self._started_at = time
 
     def see(self, view: View) -> None:
-        """Be shown what the headset shows.
+        """Receive what the headset displays.
 
         Raises:
-            UnknownName: If no intention is known for the task, with the known ones.
+            UnknownName: If the task has no intention; lists those that have.
         """
         if view.task not in INTENTIONS:
             raise UnknownName("task of the simulated operator", view.task, INTENTIONS)
@@ -65,10 +64,10 @@ class SimulatedDevice(Device):
             PREPARATIONS[view.task](self.mind)
 
     def read(self, time: float) -> OperatorFrame:
-        """Go on to `time` [s] of the robot's clock and return the frame of that instant.
+        """Advance the person to `time` [s] of the robot's clock and return its frame.
 
         Raises:
-            BadValue: If the person is engaged but was shown nothing.
+            BadValue: If the person is engaged but has been shown no task.
         """
         if self._started_at is None:
             return self.mind.make_frame(0.0)
@@ -89,7 +88,7 @@ class SimulatedDevice(Device):
         return self.mind.make_frame(clock)
 
     def is_finished(self, time: float) -> bool:
-        """Whether the person is done, or has given up, and has stayed for a moment."""
+        """Whether the person has finished or given up, and `LINGER` has passed since."""
         del time
         return self._over_at is not None and self.mind.time >= self._over_at + LINGER
 

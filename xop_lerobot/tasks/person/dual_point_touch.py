@@ -1,4 +1,4 @@
-"""Touch two points: walk up, stand, squat if they are low, reach, correct, hold."""
+"""Intentions that touch two points: walk up, squat if they are low, reach, correct, hold."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ from xop_lerobot.tasks.person.walking import compute_miss, find, go_to, set_mode
 
 POINTS = ("left_point", "right_point")
 APPROACHES = 6
-"""How often a person walks up anew before giving up."""
-SHIFT = 0.07
-"""How much closer a person stands at the next approach, or farther, if arms were bent [m]."""
+"""Number of approaches before giving up."""
+STANDOFF_STEP = 0.07
+"""Change of the standing distance per approach: closer, or farther if arms were bent [m]."""
 LEAN_AFTER = 2
-"""Number of corrections in vain after which the person leans, unless bent."""
+"""Number of unsuccessful corrections after which the person leans, unless bent."""
 
 
 def touch_two_points(mind: Mind) -> Doing:
-    """Bring both palms to their points and hold them there until it counts."""
+    """Walk up to the points and hold both palms at them until the task succeeds."""
     yield from find(mind, *POINTS)
     closer = 0.0
     for approach in range(APPROACHES):
         place = plan_place(mind, closer)
         miss, turn = compute_miss(mind, place)
-        # The first time almost there is near enough, but for who has to bend; then it was not.
+        # A coarse place suffices for the first approach, unless the person has to bend: a bent
+        # trunk cannot lean. Later approaches follow a failure, so they must be precise.
         bends = compute_bend(mind, list(get_points(mind).values())) > 0
         near = mind.person.place_tolerance * (2.0 if not (approach or bends) else 0.5)
         if miss > near or abs(turn) > mind.person.heading_tolerance:
@@ -52,11 +53,11 @@ def touch_two_points(mind: Mind) -> Doing:
             return
         points = get_points(mind)
         stretched = any(is_stretched(mind, side, point) for side, point in points.items())
-        closer += SHIFT if stretched else -SHIFT
+        closer += STANDOFF_STEP if stretched else -STANDOFF_STEP
 
 
 def reach_two_points(mind: Mind) -> Doing:
-    """Do the same where one stands, as the points are within reach."""
+    """Hold both palms at points that are within reach, without walking."""
     yield from find(mind, *POINTS)
     for _ in range(APPROACHES):
         yield from hold_points(mind)
@@ -65,19 +66,19 @@ def reach_two_points(mind: Mind) -> Doing:
 
 
 def get_points(mind: Mind) -> dict[str, np.ndarray]:
-    """Where the two points are, by the hand that shall touch them. Shapes (3,)."""
+    """Seen position of each hand's point, by side. Shapes (3,)."""
     return {side: mind.eyes.pose(f"{side}_point")[:3] for side in SIDES}
 
 
 def plan_place(mind: Mind, closer: float = 0.0) -> np.ndarray:
-    """Where to stand: before the middle of both points, facing it squarely.
+    """Plan the standing place: in front of the middle of both points, facing it squarely.
 
     Args:
-        mind: Who plans.
-        closer: How much closer than is comfortable [m].
+        mind: The person.
+        closer: Reduction of the comfortable distance [m].
 
     Returns:
-        Place of the head and heading, x y yaw of the robot's world. Shape (3,).
+        Place of the head and heading, x y yaw of the robot's world [m, m, rad]. Shape (3,).
     """
     points = get_points(mind)
     middle = (points["left"] + points["right"]) / 2
@@ -100,7 +101,10 @@ def plan_place(mind: Mind, closer: float = 0.0) -> np.ndarray:
 
 
 def hold_points(mind: Mind) -> Doing:
-    """Reach both points and keep the palms there; returns when it counts or cannot be done."""
+    """Reach both points and keep the palms there.
+
+    Returns when the task succeeds, or after `Person.corrections` corrections without progress.
+    """
     points = get_points(mind)
     yield from take_posture(mind, plan_posture(mind, list(points.values())))
     points = get_points(mind)

@@ -1,4 +1,4 @@
-"""Grasping: hold a box between both palms, lift it, release it."""
+"""Bimanual grasping skills: squeeze a box between both palms, lift it, release it."""
 
 from __future__ import annotations
 
@@ -21,67 +21,67 @@ from xop_lerobot.tasks.person.hands import (
 )
 from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 
-BESIDE = 0.06
-"""Palms come so far beside the box before they close [m]."""
+PREGRASP_GAP = 0.06
+"""Distance of the palms from the box's sides before they close [m]."""
 WRIST_CLEAR = 0.025
-"""Wrists stay so far before the box's near edge [m]."""
-FARTHEST = 0.05
-"""Palms that are not stopped end so far inside of the box's sides [m]."""
+"""Clearance between the wrists and the box's near edge [m]."""
+CLOSE_DEPTH = 0.05
+"""Goal of unobstructed palms, inside the box's sides [m]."""
 CLOSE_SPEED = 0.045
 """Mean speed of closing hands [m/s]."""
-BEHIND = 0.015
-"""A palm that far behind the own hand is stopped [m]."""
-PRESSES = 4
-"""How often the person presses on, while the palms still give way."""
+STOPPED_LAG = 0.015
+"""Lag of a palm behind the person's own hand from which it counts as stopped [m]."""
+MAX_PRESSES = 4
+"""Number of presses while the palms still give way."""
 ROBOT_LAG = 0.35
-"""How much later than oneself a robot is known to move [s]."""
+"""Expected lag of the robot behind the person's own motion [s]."""
 PRESS = 0.03
-"""Hands that press go so far beyond where they were stopped, for who has not practised [m]."""
+"""Depth of the press goal beyond where the hands were stopped, without practice [m]."""
 OUT_OF_REACH = 0.06
-"""Palms that stay so far beside their places are out of reach [m]."""
-LIFT = 0.06
-"""How high the box is lifted [m]."""
+"""Remaining error from which the pregrasp poses count as out of reach [m]."""
+LIFT_HEIGHT = 0.06
+"""Height by which the box is lifted [m]."""
 LIFTED = 0.037
-"""Rise from which the person is sure to have lifted it [m]."""
-LIFTS = 3
-"""How often a person lifts on, if the robot's arms come up less than the own."""
+"""Seen rise from which the box counts as lifted [m]."""
+MAX_LIFTS = 3
+"""Number of lifts if the robot's arms rise less than the person's."""
 LEFT_BEHIND = 0.015
-"""A box that rises so much less than the hands stays behind [m]."""
+"""Rise of the hands over that of the box from which the box is left behind [m]."""
 BESIDE_TOLERANCE = 0.02
-"""How far beside their places the palms may be before they close [m]."""
-LOST = 0.12
-"""A box that far from the middle between the palms is not held [m]."""
+"""Accepted position error of the palms before they close [m]."""
+LOST_DISTANCE = 0.12
+"""Distance of the box from the middle of the palms from which it is not held [m]."""
 CARRY_SPEED = 0.06
-"""Mean speed of hands that hold something [m/s]."""
+"""Mean speed of hands that hold an object [m/s]."""
 
 
 class OutOfReach(Exception):
-    """The hands do not come to where they should be; the person has to stand elsewhere."""
+    """Raised when the hands cannot reach their goals and the person must stand elsewhere."""
 
 
 class Slipped(Exception):
-    """The box is no longer between the hands."""
+    """Raised when the box is no longer between the hands."""
 
 
 def compute_ahead(heading: float) -> np.ndarray:
-    """Unit vector along a heading. Shape (3,)."""
+    """Unit vector along a heading [rad]. Shape (3,)."""
     return np.array([np.cos(heading), np.sin(heading), 0])
 
 
 def get_half_extents(mind: Mind, heading: float) -> np.ndarray:
-    """Half the box's extents along a heading, across it, and up [m]. Shape (3,)."""
+    """Half extents of the box along the heading, across it, and up [m]. Shape (3,)."""
     size = mind.eyes.size("box")
     across = abs(np.sin(heading - float(quat_yaw(mind.eyes.pose("box")[3:]))))
     return size[[1, 0, 2]] if across > 0.5 else size
 
 
 def compute_sides(mind: Mind, outside: float, before: float = 0.0) -> dict[str, np.ndarray]:
-    """Where the palms are beside the box. Shapes (3,).
+    """Compute palm positions at the sides of the box. Shapes (3,).
 
     Args:
-        mind: Who grasps.
+        mind: The person.
         outside: Distance of the palms from the box's sides [m].
-        before: How much nearer to the person they are than for the grasp [m].
+        before: Offset of the palms towards the person, from where they grasp [m].
     """
     head = mind.eyes.pose("head")
     yaw = float(quat_yaw(mind.eyes.pose("box")[3:]))
@@ -99,7 +99,7 @@ def compute_sides(mind: Mind, outside: float, before: float = 0.0) -> dict[str, 
 
 
 def compute_flat(mind: Mind, side: str) -> np.ndarray:
-    """Hand level along the box, its palm flat against a side. Shape (4,)."""
+    """Orientation of a level hand along the box, palm flat against its side. Shape (4,)."""
     heading = compute_heading(mind.eyes.pose("head")[3:])
     yaw = float(quat_yaw(mind.eyes.pose("box")[3:]))
     ahead = compute_ahead(float(yaw + np.pi / 2 * np.round((heading - yaw) / (np.pi / 2))))
@@ -108,9 +108,13 @@ def compute_flat(mind: Mind, side: str) -> np.ndarray:
 
 
 def bring_beside(mind: Mind) -> Doing:
-    """Bring both palms to the sides of the box, from the near side and outside."""
+    """Bring both palms to the sides of the box: first in front of it and wider, then beside it.
+
+    Raises:
+        OutOfReach: If the palms do not reach the sides.
+    """
     for before, tries in ((0.15, 1), (0.0, mind.person.corrections)):
-        sides = compute_sides(mind, BESIDE + (0.03 if before else 0.0), before)
+        sides = compute_sides(mind, PREGRASP_GAP + (0.03 if before else 0.0), before)
         wrists = {}
         for side, point in sides.items():
             quat = compute_flat(mind, side)
@@ -120,7 +124,7 @@ def bring_beside(mind: Mind) -> Doing:
         worst = math.inf
         for _ in range(tries):
             yield from mind.settle("left_palm", "right_palm")
-            sides = compute_sides(mind, BESIDE + (0.03 if before else 0.0), before)
+            sides = compute_sides(mind, PREGRASP_GAP + (0.03 if before else 0.0), before)
             yield from look_at_work(mind, sides)
             errors = compute_errors(mind, sides)
             worst = max(float(np.linalg.norm(error)) for error in errors.values())
@@ -135,10 +139,14 @@ def bring_beside(mind: Mind) -> Doing:
 def close(mind: Mind, press: float) -> Doing:
     """Close the hands on the box until they are stopped, then press.
 
-    Nobody feels what the robot touches: a hand is stopped when it is seen to fall behind the own
-    one. A hand that is stopped waits for the other.
+    Without haptic feedback a hand counts as stopped when the robot's palm is seen to fall behind
+    the person's own. A stopped hand waits for the other.
+
+    Args:
+        mind: The person.
+        press: Depth of the goals beyond where the palms are stopped [m].
     """
-    goals = compute_sides(mind, -FARTHEST)
+    goals = compute_sides(mind, -CLOSE_DEPTH)
     across = (goals["left"] - goals["right"]) / np.linalg.norm(goals["left"] - goals["right"])
     inwards = {"left": -across, "right": across}
     own = {side: mind.belief.vector_to_own(way) for side, way in inwards.items()}
@@ -171,8 +179,8 @@ def close(mind: Mind, press: float) -> Doing:
                 break
         else:
             break
-    for _ in range(PRESSES):
-        # From where the palms are seen, which is where the box stops them.
+    for _ in range(MAX_PRESSES):
+        # Relative to where the palms are seen, which is where the box stops them.
         came = {s: float((mind.feel(f"{s}_palm")[:3] - start[s]) @ inwards[s]) for s in SIDES}
         mind.note(f"press by {100 * press:.0f} cm")
         room = mind.body.compute_hands_in_room()
@@ -197,27 +205,27 @@ def _is_stopped(
     first: np.ndarray,
     inwards: np.ndarray,
 ) -> bool:
-    """Whether a palm is behind the own hand of the moment that is seen now."""
+    """Whether a palm lags behind the person's own hand at the time that is seen now."""
     i = SIDES.index(side)
     went = mind.belief.scale * float(np.linalg.norm(own[i][:3] - first[i][:3]))
     came = float((mind.feel(f"{side}_palm")[:3] - start) @ inwards)
-    return went - came > BEHIND
+    return went - came > STOPPED_LAG
 
 
 def lift(mind: Mind, rest: float) -> Generator[None, None, tuple[float, float]]:
-    """Lift the box; further, if the robot's arms come up less than the own but with the box.
+    """Lift the box, and again while the robot's arms rise less than the person's.
 
     Args:
-        mind: Who lifts.
-        rest: Height at which the box stood [m].
+        mind: The person.
+        rest: Height of the box before the lift [m].
 
     Returns:
-        Rise of the box as seen, and of the goals of the hands [m].
+        Seen rise of the box, and total rise of the hand goals [m].
     """
     before, lifted, rise = _see_hands(mind), 0.0, 0.0
-    for _ in range(LIFTS):
+    for _ in range(MAX_LIFTS):
         mind.note("lift")
-        step = LIFT - max(0.0, _see_hands(mind) - before)
+        step = LIFT_HEIGHT - max(0.0, _see_hands(mind) - before)
         yield from shift_hands(mind, np.array([0, 0, step]), CARRY_SPEED)
         yield from mind.settle()
         lifted += step
@@ -229,18 +237,18 @@ def lift(mind: Mind, rest: float) -> Generator[None, None, tuple[float, float]]:
 
 
 def _see_hands(mind: Mind) -> float:
-    """Mean height of both palms [m]."""
+    """Mean seen height of both palms [m]."""
     return float(np.mean([mind.feel(f"{side}_palm")[2] for side in SIDES]))
 
 
 def open_hands(mind: Mind) -> Doing:
-    """Take the hands off the box, to the sides, then up and back."""
+    """Move the hands apart, off the box."""
     body = mind.body
     room = body.compute_hands_in_room()
     across = room[0][:3] - room[1][:3]
     across[2] = 0
     across /= np.linalg.norm(across)
-    way = (PRESS + BESIDE) / mind.belief.scale
+    way = (PRESS + PREGRASP_GAP) / mind.belief.scale
     ends = {
         side: make_pose(room[i][:3] + (1 - 2 * i) * way * across, room[i][3:])
         for i, side in enumerate(SIDES)
@@ -250,17 +258,17 @@ def open_hands(mind: Mind) -> Doing:
 
 
 def check_held(mind: Mind) -> None:
-    """Look whether the box is still between the hands, as far as it is in view.
+    """Check by sight, if the box is in view, that it is still between the hands.
 
     Raises:
-        Slipped: If it is where it can be taken anew.
-        GaveUp: If it lies on the floor.
+        Slipped: If it has slipped but can be grasped again.
+        GaveUp: If it has fallen.
     """
     if not mind.eyes.sees("box"):
         return
     box = mind.eyes.pose("box")[:3]
     palms = np.mean([mind.feel(f"{side}_palm")[:3] for side in SIDES], axis=0)
-    if np.linalg.norm(box - palms) > LOST:
-        if box[2] < palms[2] - 3 * LOST:
+    if np.linalg.norm(box - palms) > LOST_DISTANCE:
+        if box[2] < palms[2] - 3 * LOST_DISTANCE:
             raise GaveUp("the box was dropped")
         raise Slipped

@@ -1,4 +1,7 @@
-"""Reaching: posture for the hands, and movements of the hands."""
+"""Reaching skills: the body posture for target points, and movements of the hands.
+
+Points and poses are in the robot's world unless marked *own*, which is the person's room.
+"""
 
 from __future__ import annotations
 
@@ -28,32 +31,36 @@ from xop_lerobot.tasks.person.body import (
 )
 from xop_lerobot.tasks.person.mind import Doing, Mind
 
-MARGIN = 0.08
-"""How far within the field of view a person wants to have what the hands work on [rad]."""
-NOD_MORE = 0.08
-"""Least further nod when a hand is not in view [rad]."""
+VIEW_MARGIN = 0.08
+"""Margin of target points to the edge of the field of view [rad]."""
+MIN_EXTRA_NOD = 0.08
+"""Smallest additional nod when a hand is out of view [rad]."""
 LARGEST_NOD = 0.45
-"""Largest nod of who does not bend [rad]."""
+"""Largest nod without bending the trunk [rad]."""
 LARGEST_BEND = 0.60
 """Largest bend of the trunk [rad]."""
 LOW_REACH = 0.85
-"""Share of the arm's length that hands use for what is that low."""
-KNEES = 0.1
-"""How much farther out hands work for each metre of squatting [m/m]."""
-STRETCHED = 0.8
-"""Share of the arm's length from which it counts as stretched."""
+"""Usable share of the arm's length when bending down to low targets [1]."""
+REACH_PER_SQUAT = 0.1
+"""Increase of the working distance per metre of squatting: the knees are ahead [m/m]."""
+STRETCHED_SHARE = 0.8
+"""Share of the arm's length from which an arm counts as stretched [1]."""
 LARGEST_LEAN = 0.12
-"""How far a person leans without a step [m]."""
+"""Largest lean without a step [m]."""
 SHOULDER = (-0.08, 0.18, -0.28)
-"""Left shoulder from the eyes, forward, left, up [m], for eyes at 1.6 m."""
+"""Left shoulder relative to the eyes: forward, left, up, for eyes at 1.6 m [m]."""
 ARM = (0.30, 0.26)
-"""Upper arm and forearm [m]."""
+"""Lengths of upper arm and forearm, for eyes at 1.6 m [m]."""
 HAND = 0.1
-"""From the wrist to the middle of the palm [m]."""
+"""Distance from the wrist to the middle of the palm [m]."""
 
 
 def compute_reach_time(mind: Mind, distance: float) -> float:
-    """Time of a reach [s]: Fitts's law, T = a + b log2(D/W + 1), taken with care."""
+    r"""Compute the time of a reach over `distance` [m] by Fitts's law [s].
+
+    T = c (a + b log2(D/W + 1)) with the care factor c, but at least 0.25 s, and with a mean speed
+    of at most `Person.hand_speed`.
+    """
     person = mind.person
     bits = np.log2(distance / person.hand_width + 1)
     fitts = person.care * (person.fitts_a + person.fitts_b * bits)
@@ -61,15 +68,15 @@ def compute_reach_time(mind: Mind, distance: float) -> float:
 
 
 def plan_posture(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> Posture:
-    """How to hold the body so that points of the robot's world are at a good height.
+    """Plan the posture that brings the points into the comfortable range of the hands.
 
-    Within a comfortable range below the eyes a person stands upright; for what is lower the
-    person squats, and nods to see it; for what is lower than that, bends, too.
+    Within the comfortable range below the eyes the person stands upright. For lower points it
+    squats, and nods to see them; below that it also bends the trunk.
 
     Args:
-        mind: Who plans.
-        points: What hands work at. Shapes (3,).
-        farther: How much farther than for a touch they are to be; above 0 for a grasp [m].
+        mind: The person.
+        points: Targets of the hands. Shapes (3,).
+        farther: Additional working distance compared with a touch; above 0 for a grasp [m].
     """
     look = np.array([0.0, compute_nod(mind, points, farther)])
     drop, bend = compute_drop(mind, points), compute_bend(mind, points, farther)
@@ -77,26 +84,26 @@ def plan_posture(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> 
 
 
 def compute_nod(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
-    """Nod with which points are well in view, from where they are worked at best [rad]."""
+    """Compute the nod that keeps the points well in view from the working distance [rad]."""
     bend = compute_bend(mind, points, farther)
     eyes = compute_eyes(mind, points, farther)
     lowest = eyes - mind.belief.height_to_own(float(min(point[2] for point in points)))
     ahead = compute_reach(mind) - compute_draw(mind, points, farther)
     angle = np.arctan2(mind.belief.scale * lowest, ahead)
-    nod = angle - mind.person.view_half_angles[1] + MARGIN
+    nod = angle - mind.person.view_half_angles[1] + VIEW_MARGIN
     return float(np.clip(nod, bend, max(LARGEST_NOD, bend)))
 
 
 def compute_drop(mind: Mind, points: list[np.ndarray]) -> float:
-    """How far a person squats for points of the robot's world [m, own]."""
+    """Compute how far the person squats for the points [m, own]."""
     return float(np.clip(_compute_lack(mind, points), 0.0, mind.person.leg_bend))
 
 
 def compute_bend(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
-    """How far a person bends the trunk for points that are too low for a squat [rad].
+    """Compute the bend of the trunk for points too low for a squat [rad].
 
-    As far as it goes for a grasp (`farther` > 0): the knees must stay clear of what things stand
-    on, and the arms bent.
+    For a grasp (`farther` > 0) it is either zero or the largest: the knees must stay clear of the
+    support under the object, and the arms stay bent.
     """
     lack = _compute_lack(mind, points) - mind.person.leg_bend
     if lack <= 0 or farther:
@@ -105,22 +112,22 @@ def compute_bend(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> 
 
 
 def compute_eyes(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
-    """Height of the eyes of who squats and bends for points of the robot's world [m, own]."""
+    """Compute the eye height after squatting and bending for the points [m, own]."""
     eyes = mind.person.eye_height
     sunk = compute_sinking(compute_bend(mind, points, farther), eyes)
     return eyes - compute_drop(mind, points) - sunk
 
 
 def compute_draw(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
-    """By how much nearer to the eyes than usual who bends has the hands [m, robot].
+    """Compute how much a bend shortens the working distance [m, robot].
 
-    A trunk that bends brings the eyes ahead of the shoulders, and arms that reach down do not
-    reach as far ahead.
+    A bending trunk brings the eyes ahead of the shoulders, and arms that reach down reach less far
+    ahead.
 
     Args:
-        mind: Who bends.
-        points: What hands work at. Shapes (3,).
-        farther: How much farther than for a touch they usually are [m].
+        mind: The person.
+        points: Targets of the hands. Shapes (3,).
+        farther: Additional working distance compared with a touch [m].
     """
     bend, size = compute_bend(mind, points, farther), mind.person.size
     if not bend:
@@ -128,70 +135,71 @@ def compute_draw(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> 
     ahead, up = _turn_down(SHOULDER[0], SHOULDER[2], bend)
     point = mind.belief.height_to_own(float(np.mean(points, axis=0)[2]))
     depth = compute_eyes(mind, points, farther) + size * up - point
-    # A robot that rests its hands farther ahead than people hold theirs has longer arms.
+    # A robot whose hands rest farther ahead than a person's is taken to have longer arms.
     longer = mind.eyes.rest_reach / (mind.belief.scale * mind.person.reach * size)
     length = LOW_REACH * size * (sum(ARM) + HAND) * max(longer, 1.0)
     farthest = size * ahead + float(np.sqrt(max(length**2 - depth**2, 0.0)))
-    usual = compute_reach(mind) + mind.belief.scale * KNEES * compute_drop(mind, points)
+    usual = compute_reach(mind) + mind.belief.scale * REACH_PER_SQUAT * compute_drop(mind, points)
     return max(usual + farther - mind.belief.scale * farthest, 0.0)
 
 
 def _compute_lack(mind: Mind, points: list[np.ndarray]) -> float:
-    """How far below where hands work well the points are, for who stands upright [m, own]."""
+    """Distance of the points below the comfortable range of who stands upright [m, own]."""
     person, middle = mind.person, np.mean(points, axis=0)
     below = person.eye_height - mind.belief.height_to_own(float(middle[2]))
     return below - person.reach_low * person.size
 
 
 def _turn_down(ahead: float, up: float, bend: float) -> tuple[float, float]:
-    """What is `ahead` and `up` of the eyes [m], after the trunk has bent by `bend` [rad]."""
+    """Rotate (ahead, up) of the eyes [m] by a forward bend of the trunk [rad]."""
     cos, sin = float(np.cos(bend)), float(np.sin(bend))
     return ahead * cos + up * sin, up * cos - ahead * sin
 
 
 def compute_reach(mind: Mind) -> float:
-    """How far ahead of the robot's head hands work at best [m].
+    """Compute the comfortable working distance ahead of the robot's head [m].
 
-    It is half way from where the own hands would work to where the robot's hands are at rest.
+    It is the mean of the person's own working distance, scaled, and that of the robot's resting
+    hands: the former is familiar, the latter suits the robot's arms.
     """
     own = mind.person.reach * mind.person.size
     return (mind.belief.scale * own + mind.eyes.rest_reach) / 2
 
 
 def compute_distance(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> float:
-    """From where to stand upright to what hands shall work at, in the robot's world [m].
+    """Compute the distance from the standing place to the targets, in the robot's world [m].
 
-    Who nods brings the eyes forward; who squats has the knees ahead, and works farther out.
+    Nodding brings the eyes forward; squatting puts the knees ahead, so the hands work farther out.
 
     Args:
-        mind: Who stands.
-        points: What hands work at. Shapes (3,).
-        farther: How much farther than for a touch they are to be [m].
+        mind: The person.
+        points: Targets of the hands. Shapes (3,).
+        farther: Additional working distance compared with a touch [m].
     """
-    knees = mind.belief.scale * KNEES * compute_drop(mind, points)
+    knees = mind.belief.scale * REACH_PER_SQUAT * compute_drop(mind, points)
     nod, bend = compute_nod(mind, points, farther), compute_bend(mind, points, farther)
     eyes = NECK * float(np.sin(nod)) - HIPS_BACK * float(np.sin(bend))
     return compute_reach(mind) - compute_draw(mind, points, farther) + knees + eyes + farther
 
 
 def is_stretched(mind: Mind, side: str, point: np.ndarray) -> bool:
-    """Whether the arm has to be stretched, or nearly so, to bring the palm to a point."""
+    """Whether the arm is nearly stretched when the palm is at `point`."""
     frame = mind.body.posture.compute_frame(mind.person.eye_height)
     target = mind.belief.point_to_own(point, mind.body.compute_head())
     shoulder = _apply(frame, mind.person.size * _compute_shoulder(mind, side))
     reach = float(np.linalg.norm(target - shoulder))
-    share = LOW_REACH if mind.body.posture.bend else STRETCHED
+    share = LOW_REACH if mind.body.posture.bend else STRETCHED_SHARE
     return reach > share * mind.person.size * (sum(ARM) + HAND)
 
 
 def _compute_shoulder(mind: Mind, side: str) -> np.ndarray:
-    """Shoulder from the eyes along the body's heading, for eyes at 1.6 m. Shape (3,)."""
+    """Shoulder relative to the eyes along the body's heading, for eyes at 1.6 m. Shape (3,)."""
     ahead, up = _turn_down(SHOULDER[0], SHOULDER[2], mind.body.posture.bend)
     return np.array([ahead, SHOULDER[1] * (1.0 if side == "left" else -1.0), up])
 
 
 def take_posture(mind: Mind, posture: Posture) -> Doing:
-    """Squat, rise or nod; the hands go along with the head."""
+    """Move to a posture (squat, rise, bend or nod) and wait until the robot's head settles."""
     last = mind.body.posture
     way = abs(posture.drop - last.drop) + float(np.linalg.norm(posture.lean - last.lean))
     way += TRUNK * abs(posture.bend - last.bend)
@@ -202,12 +210,12 @@ def take_posture(mind: Mind, posture: Posture) -> Doing:
 
 
 def go_down(mind: Mind, posture: Posture, way: float) -> Posture:
-    """Bend the trunk of a posture whose knees are bent, and lower the hands by as much in the room.
+    """Bend the trunk of a squatting posture, lowering the hands equally in the room.
 
     Args:
-        mind: Who goes down.
-        posture: Where from; its hands are held before the body.
-        way: How far the hands shall go down [m, own].
+        mind: The person.
+        posture: Start posture, with the hands held in front.
+        way: Distance by which the hands are lowered [m, own].
     """
     eye_height = mind.person.eye_height
     trunk = TRUNK * mind.person.size
@@ -222,7 +230,7 @@ def go_down(mind: Mind, posture: Posture, way: float) -> Posture:
 
 
 def look_at_work(mind: Mind, points: Mapping[str, np.ndarray]) -> Doing:
-    """Nod until hands and points are in view; the hands stay where they are in the room."""
+    """Nod until hands and points are in view, keeping the hands fixed in the room."""
     head = mind.eyes.pose("head")
     angles = []
     for side, point in points.items():
@@ -230,12 +238,12 @@ def look_at_work(mind: Mind, points: Mapping[str, np.ndarray]) -> Doing:
             way = each - head[:3]
             angles.append(np.arctan2(-way[2], np.hypot(way[0], way[1])))
     pitch = float(quat_to_rpy(head[3:])[1])
-    more = max(angles) - pitch - mind.person.view_half_angles[1] + MARGIN / 2
+    more = max(angles) - pitch - mind.person.view_half_angles[1] + VIEW_MARGIN / 2
     if not all(mind.eyes.sees(f"{side}_palm") for side in points):
-        more = max(more, NOD_MORE)
+        more = max(more, MIN_EXTRA_NOD)
     body, last = mind.body, mind.body.posture
     nod = float(np.clip(last.look[1] + more, last.look[1], LARGEST_NOD))
-    if nod - last.look[1] < 0.02:  # not worth it
+    if nod - last.look[1] < 0.02:  # not worth a movement
         return
     mind.note(f"nod by {np.degrees(nod - last.look[1]):.0f}°")
     room = body.compute_hands_in_room()
@@ -245,11 +253,11 @@ def look_at_work(mind: Mind, points: Mapping[str, np.ndarray]) -> Doing:
 
 
 def lean(mind: Mind, errors: Mapping[str, np.ndarray]) -> Doing:
-    """Lean to where the hands do not get; they stay where they are in the room.
+    """Lean towards targets out of the hands' reach, keeping the hands fixed in the room.
 
     Args:
-        mind: Who leans.
-        errors: What the palms miss their points by, robot's world [m]. Shapes (3,).
+        mind: The person.
+        errors: Position errors of the palms, robot's world [m]. Shapes (3,).
     """
     body, last = mind.body, mind.body.posture
     missed = np.mean(list(errors.values()), axis=0)
@@ -261,9 +269,9 @@ def lean(mind: Mind, errors: Mapping[str, np.ndarray]) -> Doing:
 
 
 def compute_wrist(mind: Mind, side: str, palm: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """Wrist pose that brings the palm to a point, with the hand turned so. Shape (7,).
+    """Compute the wrist pose that puts the palm at a point with this orientation. Shape (7,).
 
-    How the robot's palm sits on its wrist a person sees.
+    The offset from wrist to palm is that of the robot's hand as seen.
     """
     if mind.eyes.sees(f"{side}_wrist") and mind.eyes.sees(f"{side}_palm"):
         wrist, seen = mind.eyes.pose(f"{side}_wrist"), mind.eyes.pose(f"{side}_palm")
@@ -274,10 +282,10 @@ def compute_wrist(mind: Mind, side: str, palm: np.ndarray, quat: np.ndarray) -> 
 
 
 def compute_pointing(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
-    """How a hand is turned that goes for a point: straight on the forearm, palm inwards. (4,).
+    """Orientation of a hand that reaches for a point, palm inwards. Shape (4,).
 
-    The forearm follows from the own arm: two links from shoulder to wrist, elbow down and a
-    little out.
+    The hand is aligned with the forearm, and the forearm follows from the person's arm: two links
+    from shoulder to wrist, elbow down and slightly out.
     """
     left, size = (1.0 if side == "left" else -1.0), mind.person.size
     body, belief = mind.body, mind.belief
@@ -287,7 +295,7 @@ def compute_pointing(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
     shoulder = _compute_shoulder(mind, side)
     pole = np.array([-0.2, 0.35 * left, -1.0])
     forearm = np.array([1.0, 0, 0])
-    for _ in range(5):  # the wrist is where the hand, straight on the forearm, ends at the point
+    for _ in range(5):  # fixed point: the wrist is HAND before the point, along the forearm
         elbow = _place_elbow(shoulder, target - HAND * forearm, pole)
         forearm = _unit(target - elbow)
     outwards = np.array([0, left, 0])
@@ -297,7 +305,7 @@ def compute_pointing(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
 
 
 def _place_elbow(shoulder: np.ndarray, wrist: np.ndarray, pole: np.ndarray) -> np.ndarray:
-    """Elbow of two links from shoulder to wrist, towards the pole. Shape (3,)."""
+    """Elbow of a two-link arm from shoulder to wrist, on the pole's side. Shape (3,)."""
     upper, fore = ARM
     line = wrist - shoulder
     length = float(np.clip(np.linalg.norm(line), 0.1, 0.99 * (upper + fore)))
@@ -308,12 +316,12 @@ def _place_elbow(shoulder: np.ndarray, wrist: np.ndarray, pole: np.ndarray) -> n
 
 
 def reach(mind: Mind, wrists: Mapping[str, np.ndarray], slowness: float = 1.0) -> Doing:
-    """Bring hands to wrist poses of the robot's world, as believed; both arrive together.
+    """Move hands to wrist poses of the robot's world, as believed; both arrive together.
 
     Args:
-        mind: Who reaches.
+        mind: The person.
         wrists: Wrist poses by side. Shapes (7,).
-        slowness: Factor on the time.
+        slowness: Factor on the duration [1].
     """
     body = mind.body
     own = body.compute_head()
@@ -326,7 +334,13 @@ def reach(mind: Mind, wrists: Mapping[str, np.ndarray], slowness: float = 1.0) -
 
 
 def nudge(mind: Mind, errors: Mapping[str, np.ndarray], slowness: float = 1.0) -> Doing:
-    """Move hands by what they are seen to miss, in the robot's world [m]. Shapes (3,)."""
+    """Correct hand positions by a share of their seen errors.
+
+    Args:
+        mind: The person.
+        errors: Position errors of the palms by side, robot's world [m]. Shapes (3,).
+        slowness: Factor on the duration [1].
+    """
     body, gain = mind.body, mind.person.hand_gain
     room, goals = body.compute_hands_in_room(), {}
     for side, error in errors.items():
@@ -338,11 +352,11 @@ def nudge(mind: Mind, errors: Mapping[str, np.ndarray], slowness: float = 1.0) -
 
 
 def shift_hands(mind: Mind, way: np.ndarray, speed: float) -> Doing:
-    """Move both hands alike, so that what they hold stays held.
+    """Translate both hands equally, so that a held object stays held.
 
     Args:
-        mind: Who moves.
-        way: In the robot's world [m]. Shape (3,).
+        mind: The person.
+        way: Translation in the robot's world [m]. Shape (3,).
         speed: Mean speed of the hands [m/s].
     """
     own = mind.belief.vector_to_own(way)
@@ -356,12 +370,12 @@ def shift_hands(mind: Mind, way: np.ndarray, speed: float) -> Doing:
 
 
 def tip_hands(mind: Mind, angle: float, speed: float) -> Doing:
-    """Turn both hands about the line between the palms, and what they hold with them.
+    """Rotate both hands, and what they hold, about the line between the palms.
 
     Args:
-        mind: Who moves.
-        angle: Turn, positive tips the far side down [rad].
-        speed: Mean rate of the turn [rad/s].
+        mind: The person.
+        angle: Rotation; positive tips the far side down [rad].
+        speed: Mean turn rate [rad/s].
     """
     room = mind.body.compute_hands_in_room()
     palms = [pose[:3] + quat_rotate(pose[3:], np.array([HAND, 0, 0])) for pose in room]
@@ -378,7 +392,7 @@ def tip_hands(mind: Mind, angle: float, speed: float) -> Doing:
 
 
 def move_hands(mind: Mind, goals: Mapping[str, np.ndarray], slowness: float = 1.0) -> Doing:
-    """Move hands to poses of the own room, in one movement."""
+    """Move hands to wrist poses of the person's room in one movement."""
     body = mind.body
     room = body.compute_hands_in_room()
     ways = [np.linalg.norm(pose[:3] - room[SIDES.index(s)][:3]) for s, pose in goals.items()]
@@ -388,7 +402,7 @@ def move_hands(mind: Mind, goals: Mapping[str, np.ndarray], slowness: float = 1.
 
 
 def compute_errors(mind: Mind, points: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What each palm is seen to miss its point by, robot's world [m]. Shapes (3,)."""
+    """Compute each palm's seen position error, robot's world [m]. Shapes (3,)."""
     return {side: point - mind.feel(f"{side}_palm")[:3] for side, point in points.items()}
 
 

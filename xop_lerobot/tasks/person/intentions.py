@@ -1,4 +1,4 @@
-"""Intentions of a person by the name of the task."""
+"""Registry of the simulated person's intentions, by task name."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from xop_lerobot.tasks.person.mind import Doing, Mind
 from xop_lerobot.tasks.person.non_prehensile_transport import carry_toy, meet_hand
 
 INTENTIONS: Registry[Callable[[Mind], Doing]] = Registry("task of the simulated operator")
-"""What the person does for each task, as a generator over ticks."""
+"""Performs a task, as a generator over ticks, by task name."""
 INTENTIONS.add("dual_point_touch", touch_two_points)
 INTENTIONS.add("dual_point_reach", reach_two_points)
 INTENTIONS.add("box_pick_and_place", carry_box)
 INTENTIONS.add("non_prehensile_transport", carry_toy)
 
 PREPARATIONS: dict[str, Callable[[Mind], None]] = {"non_prehensile_transport": meet_hand}
-"""How the person holds the own body before engaging, where the task asks for it."""
+"""Posture taken before engaging, by the name of a task that needs one."""

@@ -1,4 +1,7 @@
-"""The simulated person: looks, decides, moves; one step of an intention per tick."""
+"""The simulated person as skills see it: perception, body, belief and random numbers.
+
+Skills and intentions are generators over control ticks (`Doing`); each `next` advances one tick.
+"""
 
 from __future__ import annotations
 
@@ -26,20 +29,20 @@ PALM = 0.1
 """From a person's wrist to the middle of the palm [m]."""
 
 type Doing = Iterator[None]
-"""Something that a person does: a generator that goes on by one tick for each `next`."""
+"""An activity of the person: a generator that advances by one control tick per `next`."""
 
 
 class GaveUp(Exception):
-    """The person sees no way to go on."""
+    """Raised when the person knows no further way to perform the task; the text is the reason."""
 
 
 class Mind:
-    """Eyes, body, belief and chance of one person; what skills and intentions act with.
+    """Perception, body, belief and random generator of one person, on which skills act.
 
     Args:
-        seed: Seed of the person and of all chance.
-        noise: Scale of sway and tremor.
-        attempt: Which attempt of this person; another one is another chance.
+        seed: Seed of the person and of all its random numbers.
+        noise: Scale of sway and tremor [1].
+        attempt: Index of the attempt: the same person with other random numbers.
     """
 
     def __init__(self, seed: int, noise: float = 1.0, attempt: int = 0) -> None:
@@ -51,10 +54,10 @@ class Mind:
         self.rng = np.random.default_rng(hand)
         self._belief: Belief | None = None
         self.follows_head = True
-        """Whether the person takes the robot's head for the own; not where the hand alone counts,
-        and the rest of the body may do as it likes."""
+        """Whether the person takes the robot's head for its own. False where only the hand counts
+        and the planner may move the rest of the body."""
         self.diary: list[tuple[float, str]] = []
-        """What the person did and when, in words; for people who look on."""
+        """Log of (time [s], text) of what the person did, for observers."""
 
     @property
     def time(self) -> float:
@@ -63,16 +66,16 @@ class Mind:
 
     @property
     def belief(self) -> Belief:
-        """How the robot's world lies on the own room."""
+        """Estimated transform between the robot's world and the person's room."""
         if self._belief is None:
             self._belief = Belief(self.body.compute_head(), self.eyes.pose("head"))
         return self._belief
 
     def feel(self, name: str) -> np.ndarray:
-        """Where `left_palm` or `left_wrist`, … is: as seen, or where one feels the own to be.
+        """Pose of `left_palm`, `left_wrist`, … as seen, else inferred from the person's own hand.
 
         Args:
-            name: Side and part.
+            name: Side and part, joined by an underscore.
 
         Returns:
             Pose in the robot's world. Shape (7,).
@@ -87,54 +90,58 @@ class Mind:
         return make_pose(point, quat_multiply(quat_from_yaw(self.belief.turn), own[3:]))
 
     def see(self, view: View) -> None:
-        """Be shown a view."""
+        """Receive a view; `look` perceives it after its delay."""
         self.eyes.show(view)
 
     def look(self, time: float) -> None:
-        """Perceive what has arrived by `time` [s] of the robot's clock."""
+        """Perceive the views that have arrived by `time` [s] of the robot's clock."""
         heading = None
         if self._belief is not None:
             heading = self._belief.turn + float(compute_heading(self.body.compute_head()[3:]))
         self.eyes.advance(time, float(self.body.posture.look[1]), heading)
 
     def note(self, text: str) -> None:
-        """Write down what is being done."""
+        """Log `text` in the diary, with the current time."""
         self.diary.append((round(self.time, 2), text))
 
     def scatter(self, length: float, size: int = 3) -> np.ndarray:
-        """By how much a movement of this length misses [m]. Shape (size,)."""
+        """Draw the end point error of a movement of `length` [m]. Shape (size,)."""
         return self.person.scatter * length * self.rng.standard_normal(size)
 
     def miss_level(self) -> np.ndarray:
-        """Roll and pitch of a hand that is believed to be level [rad]. Shape (2,)."""
+        """Draw roll and pitch error of a hand that is held level by feel [rad]. Shape (2,)."""
         return self.person.level_error * self.rng.standard_normal(2)
 
     def make_frame(self, stamp: float) -> OperatorFrame:
-        """Frame of the body as it is now."""
+        """Return the body's current frame, stamped `stamp` [s]."""
         return self.body.make_frame(stamp)
 
     def is_still(self, *names: str) -> bool:
-        """Whether the robot's frames are seen to stand still, or to mark time on the spot."""
+        """Whether these frames of the robot are seen to be stationary, or stepping in place."""
         walking = self.eyes.mode is Mode.MOBILE
         limit = self.person.still_walking if walking else self.person.still
         return self.eyes.compute_movement(names) <= limit
 
     def pause(self, duration: float) -> Doing:
-        """Stay as one is for `duration` [s]."""
+        """Hold still for `duration` [s]."""
         end = self.time + duration
         while self.time < end:
             yield
 
     def finish(self) -> Doing:
-        """Wait until the movement that is under way is over."""
+        """Wait until the current movement or pinch is over."""
         while self.body.is_moving or self.body.is_pinching:
             yield
 
     def settle(self, *names: str, patience: float | None = None) -> Doing:
-        """Wait until what one sees of the robot stands still, or patience is lost; then decide.
+        """Wait until the robot is seen to be stationary, or patience runs out; then decide.
 
-        People who act over a delay move and wait (Ferrell 1965): the picture of now shows a
-        robot that has not had all of the movement yet.
+        People who act over a delay use a move-and-wait strategy (Ferrell 1965): the current image
+        shows a robot that has not received all of the movement yet.
+
+        Args:
+            names: Frames to watch; head and wrists by default.
+            patience: Longest wait [s]; `Person.patience` by default.
         """
         yield from self.finish()
         watched = names or ("head", "left_wrist", "right_wrist")
@@ -147,5 +154,5 @@ class Mind:
             self.learn()
 
     def learn(self) -> None:
-        """Take in where the robot's head is seen to be for the own one."""
+        """Correct the belief by where the robot's head is seen relative to the person's own."""
         self.belief.learn(self.body.compute_head(), self.eyes.pose("head"), self.person.gain)

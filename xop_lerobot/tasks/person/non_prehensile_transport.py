@@ -1,4 +1,4 @@
-"""Carry a toy on the open left palm over the obstacles, and tip it into the opening."""
+"""Intention that carries a toy on the open left palm over obstacles and tips it into a box."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 from xop_lerobot.tasks.person.walking import compute_miss, go_to, set_mode
 
 NOD = 0.25
-"""How far the person nods to see the own palm [rad]."""
-CLEAR = 0.10
-"""The palm passes so far over the tops of the obstacles [m]."""
-OVER_RIM = 0.08
-"""The palm tips so far over the rim [m]."""
-EDGE = 0.04
-"""From the middle of a palm to its edge, for who does not know the hand [m]."""
-FALL = 0.065
-"""The toy falls so far beyond that edge [m], likewise."""
-FREE = 0.12
-"""The hand starts so far to the left of the first obstacle [m]."""
+"""Nod that brings the person's own palm into view [rad]."""
+OBSTACLE_CLEARANCE = 0.10
+"""Height of the palm above the tops of the obstacles [m]."""
+RIM_CLEARANCE = 0.08
+"""Height of the palm above the container's rim while tipping [m]."""
+DEFAULT_EDGE = 0.04
+"""Distance from the middle of a palm to its edge, if the task gives no hint [m]."""
+DEFAULT_FALL = 0.065
+"""Horizontal distance that the toy falls beyond that edge, if the task gives no hint [m]."""
+START_GAP = 0.12
+"""Distance of the hand to the left of the first obstacle at the start [m]."""
 CARRY_SPEED = 0.10
-"""Mean speed of a hand on which something lies loose [m/s]."""
-AIM = (0.006, 0.015)
-"""How well the toy is aimed: along the hand, and across [m]."""
+"""Mean speed of a hand on which an object lies loose [m/s]."""
+AIM_TOLERANCES = (0.006, 0.015)
+"""Accepted error of the aim, along the hand and across it [m]."""
 LOOK_AGAIN_S = 1.0
-"""Before it is tipped, the aim is looked at again after so long [s]."""
-TIP = 1.3
+"""Pause before the aim is confirmed by a second look [s]."""
+TIP_ROLL = 1.3
 """Roll that tips the palm [rad]."""
 TIP_S = 1.6
-"""Time of the roll [s]."""
-TILTED = 0.5
-"""Tilt from which the palm is seen to have tipped [rad]."""
+"""Duration of the roll [s]."""
+TIPPED_TILT = 0.5
+"""Seen tilt from which the palm has tipped [rad]."""
 WAIT_S = 2.5
-"""How long the person holds still at first, until the toy lies on the palm [s]."""
+"""Initial pause until the toy lies on the palm [s]."""
 
 
 def carry_toy(mind: Mind) -> Doing:
-    """Take the toy on the palm to the container and tip it in."""
+    """Carry the toy on the palm to the container and tip it in."""
     while mind.eyes.is_blind:
         yield
     mind.eyes.look_over()
@@ -66,13 +66,13 @@ def carry_toy(mind: Mind) -> Doing:
         for name in mind.eyes.names
         if name.startswith("obstacle") and mind.eyes.knows(name)
     )
-    height = max(top + CLEAR, float(opening[2]) + OVER_RIM)
+    height = max(top + OBSTACLE_CLEARANCE, float(opening[2]) + RIM_CLEARANCE)
     palm = mind.feel("left_palm")[:3]
     mind.note("lift the toy")
     yield from carry_to(mind, np.array([*palm[:2], height]))
     mind.note("over the obstacle")
     spot = compute_spot(mind, height)
-    # First beyond the obstacle, straight to the side, then to where it is tipped.
+    # Sideways first, so that the palm passes the obstacle at height before it moves ahead.
     across = palm + ((spot - palm) @ left) * left
     yield from carry_to(mind, np.array([*across[:2], height]))
     yield from carry_to(mind, spot)
@@ -81,7 +81,7 @@ def carry_toy(mind: Mind) -> Doing:
 
 
 def look_down(mind: Mind) -> Doing:
-    """Nod to see hand and opening; the hands stay where they are in the room."""
+    """Nod to see hand and opening, keeping the hands fixed in the room."""
     body, last = mind.body, mind.body.posture
     keep = dict(zip(SIDES, body.compute_hands_in_room(), strict=True))
     posture = replace(last, look=np.array([0.0, NOD]))
@@ -89,7 +89,7 @@ def look_down(mind: Mind) -> Doing:
 
 
 def compute_axes(mind: Mind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middle of the opening, and the directions ahead and left of who faces it. Shapes (3,)."""
+    """Centre of the opening, and the ahead and left directions when facing it. Shapes (3,)."""
     opening = mind.eyes.pose("opening")
     heading = float(quat_yaw(opening[3:])) + np.pi / 2
     course = mind.belief.turn + float(mind.body.posture.place[2])
@@ -100,13 +100,13 @@ def compute_axes(mind: Mind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def walk_up(mind: Mind) -> Doing:
-    """Walk to where the hand is to the left of the first obstacle, if that is far."""
+    """Walk to where the hand is left of the first obstacle, unless it is there already."""
     opening, ahead, left = compute_axes(mind)
     head, palm = mind.eyes.pose("head"), mind.feel("left_palm")
     heading = float(np.arctan2(ahead[1], ahead[0]))
     turn = quat_from_yaw(heading - compute_heading(head[3:]))
     offset = quat_rotate(turn, palm[:3] - head[:3])
-    hand = mind.eyes.pose("obstacle_0")[:3] + FREE * left
+    hand = mind.eyes.pose("obstacle_0")[:3] + START_GAP * left
     hand = hand + ((opening - hand) @ ahead) * ahead
     hand = hand - mind.eyes.recall("toy_forward", 0.0) * ahead
     place = np.array([*(hand - offset)[:2], heading])
@@ -122,22 +122,25 @@ def walk_up(mind: Mind) -> Doing:
 
 
 def compute_spot(mind: Mind, height: float) -> np.ndarray:
-    """Where the palm has to be for the toy to fall into the opening. Shape (3,)."""
+    """Palm position from which the toy falls into the opening. Shape (3,)."""
     opening, ahead, left = compute_axes(mind)
     spot = opening - mind.eyes.recall("toy_forward", 0.0) * ahead
-    spot = spot + (mind.eyes.recall("edge", EDGE) + mind.eyes.recall("fall", FALL)) * left
+    spot = (
+        spot
+        + (mind.eyes.recall("edge", DEFAULT_EDGE) + mind.eyes.recall("fall", DEFAULT_FALL)) * left
+    )
     return np.array([*spot[:2], height])
 
 
 def compute_palm_up(mind: Mind, roll: float = 0.0) -> np.ndarray:
-    """The palm up, fingers ahead, rolled to the right. Shape (4,)."""
+    """Palm up, fingers ahead, rolled to the right by `roll` [rad]. Shape (4,)."""
     _, ahead, _ = compute_axes(mind)
     heading = float(np.arctan2(ahead[1], ahead[0]))
     return quat_multiply(quat_from_yaw(heading), quat_from_rpy(np.pi + roll, 0, 0))
 
 
 def carry_to(mind: Mind, point: np.ndarray) -> Doing:
-    """Bring the left palm to a point, level and slowly, correcting until it is there."""
+    """Move the left palm to a point, level and slowly, with up to two corrections."""
     for attempt in range(3):
         error = point - mind.feel("left_palm")[:3]
         length = float(np.linalg.norm(error))
@@ -148,19 +151,19 @@ def carry_to(mind: Mind, point: np.ndarray) -> Doing:
 
 
 def aim(mind: Mind) -> Doing:
-    """Bring the toy beside the opening as precisely as one sees, and look twice."""
+    """Bring the toy beside the opening, to within `AIM_TOLERANCES` at two looks in a row."""
     looked = False
     for _ in range(2 * mind.person.corrections):
         opening, ahead, left = compute_axes(mind)
-        spot = compute_spot(mind, float(opening[2]) + OVER_RIM)
+        spot = compute_spot(mind, float(opening[2]) + RIM_CLEARANCE)
         error = spot - mind.feel("left_palm")[:3]
         if mind.eyes.sees("toy"):
-            # What counts is where the toy lies, not where the hand is.
+            # Along the hand the toy's position counts, since it may have slid on the palm.
             off = (opening - mind.eyes.pose("toy")[:3]) @ ahead
             error = error + (off - error @ ahead) * ahead
         mind.note(f"toy {100 * (error @ ahead):.1f} cm, {100 * (error @ left):.1f} cm beside")
-        fine = abs(error @ ahead) <= AIM[0] and abs(error @ left) <= AIM[1]
-        if fine and abs(error[2]) <= 1.5 * AIM[1]:
+        fine = abs(error @ ahead) <= AIM_TOLERANCES[0] and abs(error @ left) <= AIM_TOLERANCES[1]
+        if fine and abs(error[2]) <= 1.5 * AIM_TOLERANCES[1]:
             if looked:
                 return
             looked = True
@@ -171,23 +174,28 @@ def aim(mind: Mind) -> Doing:
 
 
 def tip(mind: Mind) -> Doing:
-    """Free the palm from keeping level, by a double pinch of both hands, and roll it over."""
+    """Release the level constraint by a double pinch of both hands, then roll the palm over.
+
+    Raises:
+        GaveUp: If the palm stays level after three attempts.
+    """
     for _ in range(3):
         mind.note("double pinch of both hands")
         mind.body.double_pinch("left", "right")
         yield from mind.finish()
         yield from mind.pause(1.0)
-        # A hand that is free again turns to how the person holds the own, and takes the toy along.
+        # Without the constraint the robot's hand takes the tilt of the person's, which moves the
+        # toy; so aim again.
         yield from aim(mind)
         mind.note("tip")
         room = mind.body.compute_hands_in_room()[0]
-        tipped = mind.belief.quat_to_own(compute_palm_up(mind, TIP))
+        tipped = mind.belief.quat_to_own(compute_palm_up(mind, TIP_ROLL))
         end = mind.body.with_hands_in_room(mind.body.posture, {"left": make_pose(room[:3], tipped)})
         mind.body.move(end, TIP_S)
         yield from mind.settle("left_palm")
         yield from mind.pause(1.5)
         up = quat_rotate(mind.feel("left_palm")[3:], np.array([0, 0, -1.0]))
-        if mind.eyes.success or np.arccos(np.clip(up[2], -1, 1)) > TILTED:
+        if mind.eyes.success or np.arccos(np.clip(up[2], -1, 1)) > TIPPED_TILT:
             yield from mind.pause(1.5)
             return
         mind.note("the palm stays level")
@@ -199,7 +207,7 @@ def tip(mind: Mind) -> Doing:
 
 
 def _push(mind: Mind, error: np.ndarray, gain: float) -> Doing:
-    """Move the left hand by a share of what is missing, slowly, palm up."""
+    """Move the left hand by `gain` times the error, slowly, palm up."""
     room = mind.body.compute_hands_in_room()[0]
     step = gain * mind.belief.vector_to_own(error)
     length = float(np.linalg.norm(step))
@@ -212,7 +220,7 @@ def _push(mind: Mind, error: np.ndarray, gain: float) -> Doing:
 
 
 def meet_hand(mind: Mind) -> None:
-    """Hold the left hand as the robot holds its own, before one engages."""
+    """Hold the left hand like the robot's before engaging."""
     posture = mind.eyes.first_look
     if posture is None:
         return

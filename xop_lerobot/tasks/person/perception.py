@@ -1,4 +1,4 @@
-"""Perception of the robot's world: delayed, within the field of view, with errors."""
+"""Perception of the robot's world: delayed, limited to the field of view, with errors."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ from xop_lerobot.operator.display import SeenObject, View
 from xop_lerobot.tasks.person.person import Person
 
 WINDOW = 0.4
-"""Time over which a person judges whether something moves [s]."""
+"""Time over which movement is judged [s]."""
 SETTLE = 0.3
-"""Time over which what is seen is averaged, as long as it stands still [s]."""
+"""Time constant of averaging what is seen while it is stationary [s]."""
 JUMP = 0.06
-"""Distance beyond which a thing has moved, and its place is seen anew [m]."""
+"""Displacement beyond which a thing has moved and the average restarts [m]."""
 WIDE = 0.8
-"""How far aside of the robot's head its cameras let a person look [rad]."""
+"""Range to either side of the robot's head, and down, in which its cameras let a person look
+[rad]."""
 SHARED, OWN = 0.8, 0.6
-"""Parts of an error that all things have in common, and that each has for itself."""
+"""Weights of the error that all things have in common and of each thing's own."""
 TURN_NOISE = 0.02
-"""Error of the orientation of what is seen [rad]."""
+"""Error of seen orientations [rad]."""
 HANDS = ("left_wrist", "right_wrist", "left_palm", "right_palm")
 
 
 class _Drift:
-    """An error that changes slowly: an Ornstein-Uhlenbeck process of unit variance."""
+    """Slowly changing error: an Ornstein-Uhlenbeck process of unit variance. Shape (6,)."""
 
     def __init__(self, rng: np.random.Generator, time_constant: float) -> None:
         self._rng, self._time_constant = rng, time_constant
@@ -54,17 +55,17 @@ class _Drift:
 
 
 class Perception:
-    """Keeps what was shown, and gives out what a person would know of it by now.
+    """What a person knows of the robot's world by now, from the views shown to it.
 
-    A thing at distance d is seen at :math:`(1 + b)d` along the line of sight, b the person's own
-    bias, with a slow error that grows with d; so two things that are close together are seen at
-    nearly the right distance from each other. What leaves the field of view is remembered where
-    it was seen last. The robot's hands and what is about it are seen from the robot's head,
-    whose own place a person knows from the floor and the walls.
+    A thing at distance d is seen at :math:`(1 + b)d` along the line of sight, where b is the
+    person's own bias, plus a slowly changing error that grows with d. Most of that error is common
+    to all things, so the distance between two neighbours is seen almost correctly. Outside the
+    field of view a thing is remembered where it was last seen. Everything is seen from the robot's
+    head, whose own position the person knows from floor and walls.
 
     Args:
-        person: Delays, field of view and errors.
-        rng: Source of the errors.
+        person: Delays, field of view and error sizes.
+        rng: Random generator of the errors.
     """
 
     def __init__(self, person: Person, rng: np.random.Generator) -> None:
@@ -80,20 +81,21 @@ class Perception:
         self._first_look: np.ndarray | None = None
 
     def show(self, view: View) -> None:
-        """Take what the robot's cameras see now; the person knows of it later."""
+        """Queue the robot's current view; the person perceives it after its delay."""
         if not self._queue and self.is_blind:
             self._rest_reach = _measure_reach(view)
             self._first_look = _measure_hand(view)
         self._queue.append(view)
 
     def advance(self, time: float, nod: float = 0.0, heading: float | None = None) -> None:
-        """Perceive all that has arrived by `time` [s] of the robot's clock.
+        """Perceive all views that have arrived by `time` [s] of the robot's clock.
 
         Args:
-            time: Now [s].
-            nod: How far the person's head is nodded; the robot's cameras see more than the
-                headset shows, so a person looks down also where the robot does not [rad].
-            heading: Where the person looks, in the robot's world [rad]; None is as the robot.
+            time: Current time [s].
+            nod: Pitch of the person's head, positive down [rad]. The robot's cameras see more than
+                the headset shows, so the person can look further down than the robot's head does.
+            heading: Direction the person looks, in the robot's world [rad]; None for that of the
+                robot's head.
         """
         self._nod, self._heading = nod, heading
         while self._queue and self._queue[0].time <= time - self._person.delay + 1e-9:
@@ -101,7 +103,7 @@ class Perception:
 
     @property
     def is_blind(self) -> bool:
-        """Whether nothing has been seen yet."""
+        """Whether nothing has been perceived yet."""
         return not self._trail
 
     @property
@@ -110,31 +112,31 @@ class Perception:
 
     @property
     def time(self) -> float:
-        """When what is known now has happened [s, robot's clock]."""
+        """Time of the latest perceived view [s, robot's clock]."""
         return self._view.time
 
     @property
     def task(self) -> str:
-        """Name of the task."""
+        """Name of the displayed task."""
         return self._view.task
 
     @property
     def mode(self) -> Mode:
-        """Mode that the display shows."""
+        """Mode shown on the display."""
         return self._view.mode
 
     @property
     def success(self) -> bool:
-        """Whether the display says that the task is accomplished."""
+        """Whether the display reports success."""
         return self._view.success
 
     @property
     def fallen(self) -> bool:
-        """Whether the robot has fallen."""
+        """Whether the robot is seen to have fallen."""
         return self._view.fallen
 
     def look_over(self) -> None:
-        """Know roughly where everything is, as who looked the scene over before engaging."""
+        """Remember roughly where everything is, as after looking over the scene before engaging."""
         for name, thing in self._view.objects.items():
             if name not in self._seen:
                 blur = 5 * self._person.place_noise * self._rng.standard_normal(3)
@@ -142,11 +144,11 @@ class Perception:
                 self._seen[name] = SeenObject(pose, np.array(thing.size))
 
     def recall(self, name: str, default: float) -> float:
-        """What a person who has practised the task knows, by name [m]."""
+        """Return the task's hint `name` [m], which a practised person knows."""
         return float(self._view.hints.get(name, default))
 
     def knows(self, name: str) -> bool:
-        """Whether the thing was ever seen."""
+        """Whether the thing has ever been seen."""
         return name in self._seen
 
     def sees(self, name: str) -> bool:
@@ -154,16 +156,16 @@ class Perception:
         return name in self._in_view
 
     def pose(self, name: str) -> np.ndarray:
-        """Where the thing is, or was when it was last seen, robot's world. Shape (7,)."""
+        """Pose of the thing where it is, or was last seen, in the robot's world. Shape (7,)."""
         return self._seen[name].pose
 
     def size(self, name: str) -> np.ndarray:
-        """Half the extents of the thing [m]. Shape (3,)."""
+        """Half extents of the thing [m]. Shape (3,)."""
         return self._seen[name].size
 
     @property
     def rest_reach(self) -> float:
-        """How far ahead of its head the robot holds its palms, as it waits for a person [m].
+        """Distance of the waiting robot's palms ahead of its head [m].
 
         People look the robot over before they put the headset on.
         """
@@ -171,16 +173,16 @@ class Perception:
 
     @property
     def first_look(self) -> np.ndarray | None:
-        """The robot's left wrist from its head, lengths over its head's height. Shape (7,)."""
+        """Left wrist in the head's frame before engaging, over head height. Shape (7,)."""
         return self._first_look
 
     @property
     def names(self) -> list[str]:
-        """Everything that exists for the task, seen or not."""
+        """Names of all objects of the task, seen or not."""
         return list(self._view.objects)
 
     def compute_movement(self, names: tuple[str, ...]) -> float:
-        """How far the fastest of the robot's frames has moved in the last 0.4 s [m]."""
+        """Largest displacement of these robot frames within the last `WINDOW` [m]."""
         first, last = self._trail[0].frames, self._view.frames
         if self._view.time - self._trail[0].time < 0.9 * WINDOW:
             return np.inf
@@ -209,7 +211,7 @@ class Perception:
             self._look_at(name, thing, head, dt)
 
     def _compute_gaze(self, head: np.ndarray) -> np.ndarray:
-        """Orientation of the view: the robot's head, turned to where the person looks. (4,)."""
+        """Orientation of the view: the robot's head, turned to the person's gaze. Shape (4,)."""
         down = max(self._nod - float(quat_to_rpy(head)[1]), 0.0)
         gaze = quat_multiply(head, quat_from_rpy(0, min(down, WIDE), 0))
         if self._heading is None:
@@ -223,7 +225,7 @@ class Perception:
             return
         self._in_view.add(name)
         person = self._person
-        # What is seen at once is seen with much the same error; only some of it is a thing's own.
+        # Errors seen at the same time are correlated: relative positions stay nearly right.
         error = SHARED * self._get_drift("").value + OWN * self._get_drift(name).value
         distance = max(float(np.linalg.norm(offset)), 1e-6)
         ray = offset / distance
@@ -236,7 +238,7 @@ class Perception:
         self._note(name, SeenObject(make_pose(seen, quat), np.array(thing.size)), dt)
 
     def _is_in_view(self, offset: np.ndarray, radius: float) -> bool:
-        """Whether the middle of a thing, or much of it, is within the field of view."""
+        """Whether the centre of a thing, or half its radius, is within the field of view."""
         wide, high = self._person.view_half_angles
         distance = float(np.linalg.norm(offset))
         slack = np.arctan2(0.5 * radius, max(distance, 1e-6))
@@ -250,7 +252,7 @@ class Perception:
         return self._drifts[name]
 
     def _note(self, name: str, thing: SeenObject, dt: float) -> None:
-        """Average what stands still, follow what moves."""
+        """Remember a thing: average its position while stationary, replace it once moved."""
         last = self._seen.get(name)
         if last is not None:
             step = thing.pose[:3] - last.pose[:3]
@@ -263,16 +265,16 @@ class Perception:
 
 
 def _measure_reach(view: View) -> float:
-    """From the head to the middle of the palms, along the head's heading [m]."""
+    """Distance from the head to the middle of the palms along the head's heading [m]."""
     head = view.frames["head"]
     palms = [pose[:3] for name, pose in view.frames.items() if name.endswith("_palm")]
-    way = np.mean(palms, axis=0) - head[:3]
+    offset = np.mean(palms, axis=0) - head[:3]
     heading = compute_heading(head[3:])
-    return float(way[0] * np.cos(heading) + way[1] * np.sin(heading))
+    return float(offset[0] * np.cos(heading) + offset[1] * np.sin(heading))
 
 
 def _measure_hand(view: View) -> np.ndarray:
-    """Left wrist from the head along its heading, over the head's height. Shape (7,)."""
+    """Left wrist relative to the levelled head, position over head height. Shape (7,)."""
     head = view.frames["head"]
     wrist = pose_multiply(pose_inverse(level_pose(head)), view.frames["left_wrist"])
     return make_pose(wrist[:3] / head[2], wrist[3:])

@@ -1,4 +1,4 @@
-"""Parameters of the simulated person, with units and sources."""
+"""Parameters of the simulated person, with units; sources in `docs/how_it_works/operator.md`."""
 
 from __future__ import annotations
 
@@ -9,46 +9,46 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Person:
-    """Parameters of one person; `docs/how_it_works/operator.md` has the sources.
+    """Parameters of one person.
 
     Attributes:
-        eye_height: Height of the eyes over the floor, standing [m].
-        leg_bend: How far the eyes can be lowered by squatting [m].
-        reach: Distance ahead of the eyes at which the hands of a person with eyes at 1.6 m work
-            comfortably [m].
-        reach_low: How far below the eyes they still do [m].
-        reach_high: How far below the eyes they do at least [m].
-        display_delay: From an event at the robot to its picture in the headset [s].
-        visual_delay: From the picture to what the person knows of it [s].
-        decision_s: Time to decide on the next movement, once the picture stands still [s].
-        view_half_angles: Half of the field of view, sideways and up or down [rad].
-        depth_bias: Standard deviation between persons of the error of distances, relative.
-        depth_noise: Error of a thing's distance, over its distance.
-        side_noise: Error of a thing's place across the line of sight, over its distance.
-        place_noise: Error that remains at any distance [m].
-        noise_s: Time over which such an error lasts [s].
+        eye_height: Height of the eyes above the floor, standing [m].
+        leg_bend: Largest lowering of the eyes by bending the knees [m].
+        reach: Comfortable working distance of the hands ahead of the eyes, for eyes at 1.6 m [m].
+        reach_low: Lower end of the comfortable range, below the eyes [m].
+        reach_high: Upper end of the comfortable range, below the eyes [m].
+        display_delay: From an event at the robot to its image in the headset [s].
+        visual_delay: From the image to the person's knowledge of it [s].
+        decision_s: Time to decide on the next movement once the image is stationary [s].
+        view_half_angles: Half of the field of view, horizontal and vertical [rad].
+        depth_bias: Standard deviation between persons of the relative error of distance [1].
+        depth_noise: Error along the line of sight, relative to the distance [1].
+        side_noise: Error across the line of sight, relative to the distance [1].
+        place_noise: Position error that remains at any distance [m].
+        noise_s: Correlation time of these errors [s].
         fitts_a: Intercept of Fitts's law [s].
-        fitts_b: Its slope [s/bit].
-        care: Factor on the time of a reach: a robot is moved with more care than a stylus.
+        fitts_b: Slope of Fitts's law [s/bit].
+        care: Factor on the time of a reach; people move a robot more carefully than a stylus [1].
         hand_speed: Largest mean speed of a hand [m/s].
-        hand_width: Width of the target that a reach is timed for [m].
-        posture_speed: Mean speed of the head when squatting or leaning [m/s].
-        walk_speed: Speed of walking [m/s].
-        walk_start: Time to reach it, and to stop [s].
-        turn_speed: Peak rate of turning the body or the head [rad/s].
-        step_length: Distance up to which a person steps sideways or back, rather than turn [m].
-        scatter: Standard deviation of where a movement ends, over its length.
-        level_error: Standard deviation of the turn of a hand that is held level by feel, about
-            each axis, drawn anew with each movement [rad].
-        gain: Share of a seen error that one correction takes out.
-        hand_gain: The same of a hand.
-        patience: Longest wait until what is seen stands still [s].
-        still: Movement in 0.4 s below which a thing stands still [m].
-        still_walking: The same in mobile mode, where a legged robot marks time [m].
-        place_tolerance: How far beside where a person wants to stand is good enough [m].
-        heading_tolerance: The same of the heading [rad].
-        hand_tolerance: Distance from palm to point that is good enough [m].
-        corrections: Number of corrections after which another way is tried.
+        hand_width: Target width in Fitts's law [m].
+        posture_speed: Mean speed of the head while squatting or leaning [m/s].
+        walk_speed: Walking speed [m/s].
+        walk_start: Time to accelerate to it, and to stop [s].
+        turn_speed: Peak turn rate of body or head [rad/s].
+        step_length: Distance up to which the person sidesteps or steps back rather than turning
+            [m].
+        scatter: Standard deviation of a movement's end point, relative to its length [1].
+        level_error: Standard deviation of the tilt of a hand held level by feel, about each axis,
+            drawn for each movement [rad].
+        gain: Share of a seen error that one correction removes [1].
+        hand_gain: The same for corrections of a hand [1].
+        patience: Longest wait for the image to become stationary [s].
+        still: Movement within 0.4 s below which something counts as stationary [m].
+        still_walking: The same in mobile mode, where a legged robot steps in place [m].
+        place_tolerance: Accepted error of the standing position [m].
+        heading_tolerance: Accepted error of the heading [rad].
+        hand_tolerance: Accepted distance between palm and target point [m].
+        corrections: Number of failed corrections after which another strategy is tried.
         time_limit: Time after which the person gives up [s].
     """
 
@@ -91,12 +91,12 @@ class Person:
 
     @property
     def size(self) -> float:
-        """Height over that of the person whose lengths are given here."""
+        """Eye height relative to the default person, for whom the lengths are given [1]."""
         return self.eye_height / Person.eye_height
 
     @property
     def delay(self) -> float:
-        """From an event at the robot to what the person knows of it [s]."""
+        """From an event at the robot to the person's knowledge of it [s]."""
         return self.display_delay + self.visual_delay
 
 
@@ -104,7 +104,7 @@ def draw_person(rng: np.random.Generator) -> Person:
     """Draw the parameters of one person.
 
     Args:
-        rng: Source of the person.
+        rng: Random generator; equal states give equal persons.
     """
     mean = Person()
     quick = float(np.clip(rng.normal(1.0, 0.08), 0.85, 1.15))

@@ -1,4 +1,4 @@
-"""Searching, walking, and changing the mode."""
+"""Locomotion skills: search for objects, walk to a place, and switch the mode."""
 
 from __future__ import annotations
 
@@ -17,40 +17,48 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.tasks.person.body import Posture, relaxed_hands, stand_upright
 from xop_lerobot.tasks.person.mind import Doing, GaveUp, Mind
 
-LAG = 0.4
-"""How long a person still looks when the own turn is over: the robot may be behind [s]."""
+ROBOT_LAG = 0.4
+"""Time to keep looking after the person's own turn, as the robot may lag [s]."""
 MODE_WAIT = 1.4
-"""Longest wait for the display to show the other mode [s]."""
-GLANCE = 0.9
-"""Turn of the head with which a person looks to a side [rad]."""
-LOW = 0.5
-"""Share of the robot's height under which things at its feet are not seen by who looks ahead."""
+"""Longest wait for the display to show the requested mode [s]."""
+GLANCE_ANGLE = 0.9
+"""Head turn for a look to either side [rad]."""
+LOW_SHARE = 0.5
+"""Share of the robot's head height below which objects at its feet are out of view ahead."""
 LOOK_DOWN, LOOK_DOWN_S = 0.45, 1.0
-"""Nod with which a person looks for them [rad], and its time [s]."""
-RISEN = 0.02
-"""A head that has come up so far is rising [m]."""
+"""Nod to look for low objects [rad], and its duration [s]."""
+RISING_STEP = 0.02
+"""Rise of the robot's head from which it is standing up [m]."""
 MODE_TRIES = 6
-"""How often a person tries a double pinch before giving up."""
-MOST_STUCK = 3
-"""How often a person tries to go on with a robot that strains."""
-LENIENT = (4, 1.5)
-"""After so many legs a person has to do with so many times the usual tolerance."""
-BRIDGED = 0.2
-"""Way that is left to arms and a lean, where a robot does not come any nearer [m]."""
-STRAIN = (0.06, 0.2)
-"""Difference of height [m] and of tilt [rad] to the own head from which a robot strains."""
-LADEN = 0.5
-"""Factor on the speed of who carries something."""
-FALLS_SHORT, AIM_BEYOND, MOST_BEYOND = 0.12, 0.5, 0.4
-"""From which distance on a leg has missed its place [m]; share of it that the next one is aimed
-beyond, if two have missed it to the same side, and the most of it [m]: people get used to a robot
-that always falls short."""
+"""Number of double pinches before giving up."""
+MAX_STRAINS = 3
+"""Number of legs with a straining robot after which the place is accepted."""
+LENIENCY = (4, 1.5)
+"""Number of legs after which the tolerance is at least so many times the usual."""
+ACCEPTED_GAP = 0.2
+"""Remaining distance left to arms and a lean if the robot does not come nearer [m]."""
+STRAIN_LIMITS = (0.06, 0.2)
+"""Difference in height [m] and tilt [rad] to the person's own head that shows strain."""
+LADEN_PACE = 0.5
+"""Factor on the walking speed while carrying [1]."""
+SHORTFALL, OVERAIM, MAX_OVERAIM = 0.12, 0.5, 0.4
+"""Remaining distance of a leg that counts as falling short [m]; share of it added to the aim of the
+next leg if two legs fell short to the same side; largest such addition [m]. People adapt to a robot
+that consistently falls short."""
 TURN_FIRST = 0.35
-"""Angle up to which a person sets out without turning first [rad]."""
+"""Direction change up to which the person starts walking without turning first [rad]."""
 
 
 def find(mind: Mind, *names: str) -> Doing:
-    """Look ahead, then to both sides; what is not there is behind: turn round until it is seen."""
+    """Look ahead, then to both sides, then turn round, until all objects are seen.
+
+    Args:
+        mind: The person.
+        names: Objects to find.
+
+    Raises:
+        GaveUp: If one is not found after a full turn.
+    """
     while mind.eyes.is_blind:
         yield
     yield from mind.pause(mind.person.decision_s)
@@ -74,9 +82,9 @@ def find(mind: Mind, *names: str) -> Doing:
 
 
 def look_down(mind: Mind, names: tuple[str, ...]) -> Doing:
-    """Look down for what is not known yet, if it is known to be low; and stay so."""
+    """Look down for objects not yet seen, if the task says that some are low; keep looking down."""
     head = float(mind.eyes.pose("head")[2])
-    if mind.eyes.recall("lowest", head) > LOW * head:
+    if mind.eyes.recall("lowest", head) > LOW_SHARE * head:
         return
     mind.note("look down")
     last = mind.body.posture
@@ -85,7 +93,7 @@ def look_down(mind: Mind, names: tuple[str, ...]) -> Doing:
 
 
 def _look_up(mind: Mind) -> Doing:
-    """Look ahead again, to stand where one seems to; a nod brings the head forward."""
+    """Look ahead again: a nod brings the head forward, which would offset the standing place."""
     last = mind.body.posture
     if last.look[1]:
         mind.body.move(replace(last, look=np.array([last.look[0], 0.0])), LOOK_DOWN_S)
@@ -93,8 +101,8 @@ def _look_up(mind: Mind) -> Doing:
 
 
 def glance(mind: Mind, *names: str) -> Doing:
-    """Look to both sides without a step, for what is not known yet; then ahead again."""
-    for angle in (*(mind.rng.choice([-1, 1]) * np.array([GLANCE, -GLANCE])), 0.0):
+    """Look to both sides without a step for objects not yet seen, then ahead again."""
+    for angle in (*(mind.rng.choice([-1, 1]) * np.array([GLANCE_ANGLE, -GLANCE_ANGLE])), 0.0):
         if _knows(mind, names) and angle:
             continue
         last = mind.body.posture
@@ -105,9 +113,12 @@ def glance(mind: Mind, *names: str) -> Doing:
 
 
 def set_mode(mind: Mind, mode: Mode) -> Doing:
-    """Pinch twice with the left hand, and look at the display whether it took.
+    """Double pinch with the left hand until the display shows the mode.
 
-    A robot that squats stands up before it walks: who sees it rise waits.
+    A squatting robot stands up before it walks, so the wait is extended while it is seen to rise.
+
+    Raises:
+        GaveUp: After `MODE_TRIES` double pinches.
     """
     if mind.eyes.mode is mode:
         return
@@ -120,7 +131,7 @@ def set_mode(mind: Mind, mode: Mode) -> Doing:
         limit, height = mind.time + MODE_WAIT, mind.eyes.pose("head")[2]
         while mind.eyes.mode is not mode and mind.time < limit:
             yield
-            if mind.eyes.pose("head")[2] > height + RISEN:
+            if mind.eyes.pose("head")[2] > height + RISING_STEP:
                 limit, height = mind.time + MODE_WAIT, mind.eyes.pose("head")[2]
         if mind.eyes.mode is mode:
             return
@@ -136,19 +147,19 @@ def go_to(
     laden: bool = False,
     tries: int = 8,
 ) -> Doing:
-    """Walk until the robot's head is at a place, x y yaw of the robot's world.
+    """Walk until the robot's head is at a place.
 
-    Each leg is walked as planned, then the person stops and looks; what is left is the next
-    leg, aimed beyond the place when legs fall short of it again and again. After `tries` legs it
-    has to do.
+    Each leg is walked open loop; then the person stops, looks, and plans the next. When legs keep
+    falling short, the next one aims beyond the place. After `tries` legs the result is accepted.
 
     Args:
-        mind: Who goes.
-        place: Where the robot's head shall be, and its heading.
-        tolerance: How far beside it is good enough [m].
-        hands: Wrists while walking, from the head (2, 7); relaxed in front by default.
-        laden: Whether they carry something: then slowly, and bent as it may bend a robot.
-        tries: Most legs.
+        mind: The person.
+        place: Goal of the robot's head, x y yaw of its world [m, m, rad]. Shape (3,).
+        tolerance: Accepted position error [m]; `Person.place_tolerance` by default.
+        hands: Wrists while walking, relative to the head; relaxed by default. Shape (2, 7).
+        laden: Whether the hands carry an object: the pace is slower, and a bent robot is no sign of
+            strain.
+        tries: Largest number of legs.
     """
     person = mind.person
     near = person.place_tolerance if tolerance is None else tolerance
@@ -157,48 +168,48 @@ def go_to(
     stuck, left, ahead = 0, np.zeros(2), np.zeros(2)
     for leg in range(tries):
         miss, turn = compute_miss(mind, place)
-        if leg >= LENIENT[0]:
-            near = max(near, LENIENT[1] * person.place_tolerance)
+        if leg >= LENIENCY[0]:
+            near = max(near, LENIENCY[1] * person.place_tolerance)
         if miss <= near and abs(turn) <= person.heading_tolerance:
             return
         own, seen, turn_then = mind.body.posture.place, mind.eyes.pose("head"), mind.belief.turn
         mind.note(f"leg {leg}: {100 * miss:.0f} cm, {np.degrees(turn):.0f}° to go")
         last, left = left, place[:2] - mind.eyes.pose("head")[:2]
-        if leg > 1 and miss > FALLS_SHORT and left @ last > 0:
-            ahead += AIM_BEYOND * left
-            ahead *= min(1.0, MOST_BEYOND / max(float(np.linalg.norm(ahead)), 1e-9))
+        if leg > 1 and miss > SHORTFALL and left @ last > 0:
+            ahead += OVERAIM * left
+            ahead *= min(1.0, MAX_OVERAIM / max(float(np.linalg.norm(ahead)), 1e-9))
         aim = place + np.array([*ahead, 0.0])
         target = mind.belief.place_to_own(aim)
         target[:2] += mind.scatter(miss, 2)
         target[2] += float(mind.scatter(abs(turn), 1)[0])
-        yield from _walk(mind, target, hands, leg % 3 == 2, LADEN if laden else 1.0)
+        yield from _walk(mind, target, hands, leg % 3 == 2, LADEN_PACE if laden else 1.0)
         yield from mind.settle(patience=2.5)
         if is_strained(mind) and not laden:
             yield from _come_back(mind, own, seen, turn_then)
             stuck += 1
             miss, turn = compute_miss(mind, place)
-            bridged = miss <= BRIDGED and abs(turn) <= 2 * person.heading_tolerance
-            if stuck >= MOST_STUCK or bridged:
+            bridged = miss <= ACCEPTED_GAP and abs(turn) <= 2 * person.heading_tolerance
+            if stuck >= MAX_STRAINS or bridged:
                 return
 
 
 def is_strained(mind: Mind) -> bool:
-    """Whether the robot bends or stretches after a head that it cannot follow."""
+    """Whether the robot bends or stretches after a head goal that it cannot reach."""
     seen, own = mind.eyes.pose("head"), mind.body.compute_head()
     lift = abs(float(seen[2]) - mind.belief.scale * float(own[2]))
     tilt = np.abs(quat_to_rpy(seen[3:])[:2] - quat_to_rpy(own[3:])[:2])
-    return bool(lift > STRAIN[0] or tilt.max() > STRAIN[1])
+    return bool(lift > STRAIN_LIMITS[0] or tilt.max() > STRAIN_LIMITS[1])
 
 
 def _come_back(mind: Mind, own: np.ndarray, seen: np.ndarray, turn: float) -> Doing:
-    """Go back to as far as the robot has come along; pushing on would not help it.
+    """Walk back by what the robot did not follow, since pushing on would not help.
 
     Args:
-        mind: Who walked.
-        own: Where the person stood before. Shape (3,).
-        seen: Where the robot's head was then. Shape (7,).
-        turn: How the robot's world was believed to be turned then: a robot that bends now tells
-            nothing of it [rad].
+        mind: The person.
+        own: Standing place before the leg, in the room. Shape (3,).
+        seen: The robot's head before the leg. Shape (7,).
+        turn: Believed yaw between the worlds before the leg [rad]; a bent robot's head shows it
+            poorly.
     """
     mind.note("the robot does not come along")
     head = mind.eyes.pose("head")
@@ -210,7 +221,7 @@ def _come_back(mind: Mind, own: np.ndarray, seen: np.ndarray, turn: float) -> Do
 
 
 def compute_miss(mind: Mind, place: np.ndarray) -> tuple[float, float]:
-    """How far the robot's head is seen from a place [m], and the turn that is left [rad]."""
+    """Compute the robot head's seen distance from a place [m], and the remaining turn [rad]."""
     head = mind.eyes.pose("head")
     return (
         float(np.linalg.norm(place[:2] - head[:2])),
@@ -219,9 +230,10 @@ def compute_miss(mind: Mind, place: np.ndarray) -> tuple[float, float]:
 
 
 def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, straight: bool, pace: float) -> Doing:
-    """One leg: short ways by steps to any side, long ones ahead, with turns before and after.
+    """Walk one leg: short distances by side or back steps, long ones facing ahead.
 
-    What the steps to the side did not bring, the person then goes straight for (`straight`).
+    Long legs turn before and after. With `straight`, short ones too: it covers what side steps
+    failed to.
     """
     body, person = mind.body, mind.person
     upright = stand_upright(body.posture, hands.copy())
@@ -249,14 +261,14 @@ def _walk(mind: Mind, target: np.ndarray, hands: np.ndarray, straight: bool, pac
 
 
 def _at(mind: Mind, place: np.ndarray) -> Posture:
-    """The posture at another place (x, y, yaw), turned the shorter way."""
+    """The current posture at another place (x, y, yaw), turned the shorter way. Shape (3,)."""
     last = mind.body.posture
     turn = float(wrap_angle(place[2] - last.place[2]))
     return replace(last, place=np.array([*place[:2], last.place[2] + turn]))
 
 
 def _search(mind: Mind, names: tuple[str, ...]) -> Doing:
-    """Look while turning; what comes into view ends the turn."""
+    """Keep looking while turning; halt as soon as all objects are seen."""
     while mind.body.is_moving:
         if names and _knows(mind, names):
             yield from mind.pause(mind.person.decision_s)
@@ -264,7 +276,7 @@ def _search(mind: Mind, names: tuple[str, ...]) -> Doing:
             yield from mind.settle("head")
             return
         yield
-    limit = mind.time + mind.person.delay + LAG
+    limit = mind.time + mind.person.delay + ROBOT_LAG
     while mind.time < limit and not (names and _knows(mind, names)):
         yield
 
