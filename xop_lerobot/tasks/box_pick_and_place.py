@@ -1,4 +1,4 @@
-"""Box pick-and-place: with both hands from a support onto a table a few steps away."""
+"""Box pick-and-place: carry a box with both hands from a support to a table a few steps away."""
 
 from __future__ import annotations
 
@@ -30,48 +30,50 @@ if TYPE_CHECKING:
     from xop_lerobot.plant.simulation import Simulation
 
 BOX = (0.08, 0.13, 0.10)
-"""Half the edges of the box: deep, wide, high [m]."""
+"""Half extents of the box: depth, width, height [m]."""
 BOX_MASS = 0.6
-"""A cardboard box with little in it [kg]."""
+"""Mass of a nearly empty cardboard box [kg]."""
 BOX_FRICTION = (0.9, 0.02, 0.001)
-"""Cardboard on hands with rubber palms and on rubber mats, chosen: 0.5 to 0.8 in tables of friction
-for rubber on cardboard, about 1 for soft rubber on dry paper; torsion over patches of some
-centimetres [m], rolling [m]."""
+"""Friction of cardboard on rubber palms and mats: sliding [1], torsion [m], rolling [m]. Tables of
+friction give 0.5 to 0.8 for rubber on cardboard, about 1 for soft rubber on dry paper; torsion is
+for contact patches of a few centimetres."""
 COMPLIANCE = (0.04, 1.0)
-"""MuJoCo's time constant [s] and damping ratio of its contacts: a side of the box and the rubber
-of a hand give by about a centimetre under 100 N. Stiffer ones let the grip of a stiff arm go from
-nothing to its full torque within millimetres."""
-SEEN = 0.005
-"""The box is drawn so much narrower on either side, since its sides give [m]."""
+"""MuJoCo's time constant [s] and damping ratio of its contacts: box and palm give by about a
+centimetre under 100 N. With stiffer ones the grip of a stiff arm rises from zero to full torque
+within millimetres."""
+LOOK_INSET = 0.005
+"""Inset of the visual box on either side, since its soft sides yield [m]."""
 
 SUPPORT = (0.14, 0.17)
-"""Half the edges of the support's top: deep, wide [m]."""
+"""Half extents of the support's top: depth, width [m]."""
 TABLE = (0.22, 0.34)
-"""Half the edges of the table's top: deep, wide [m]."""
+"""Half extents of the table's top: depth, width [m]."""
 TOP = 0.02
-"""Half the thickness of both tops [m]."""
+"""Half thickness of both tops [m]."""
 COLUMN = 1.2
-"""Length of the columns, of which the lower end is under the floor [m]."""
+"""Length of the columns, which extend below the floor [m]."""
 SPOT = 0.02
-"""The marked spot is so much farther from the edge than the box's half depth [m]."""
+"""Distance of the marked spot from the edge, beyond the box's half depth [m]."""
 
 GAP = (0.25, 0.40)
-"""From the palms at rest to the middle of the box, at the start [m]."""
+"""Distance from the resting palms to the middle of the box at the start [m]."""
 BEARING = 0.3
 """Largest bearing of the box [rad]."""
 TURN = (1.2, 1.9)
-"""Bearing of the table from the start, to the left or to the right [rad]."""
+"""Absolute bearing of the table from the start, to either side [rad]."""
 TABLE_DISTANCE = (0.95, 1.15)
-"""From the start to the marked spot [m]."""
+"""Distance of the marked spot from the start [m]."""
 LEVELS = {"support": (-0.03, 0.03), "table": (-0.06, 0.0)}
-"""Heights of the tops about that at which the box's middle is where palms are at rest [m]."""
+"""Heights of the tops relative to that at which the box's middle is level with the resting palms
+[m]."""
 
 WRIST_GAP = 0.01
-"""Between the end of the arm, which is thicker than the hand, and the box [m]."""
+"""Gap between the end of the arm, which is thicker than the hand, and the box [m]."""
 LIFT, LIFTED_S = 0.03, 3.0
-"""Picked up is so high over where it stood [m], for so long [s], held by the robot alone."""
+"""Picked up: this high above its rest [m], for this long [s], held by the robot alone."""
 PLACED_S, UPRIGHT, STILL = 1.0, math.radians(15), 0.02
-"""Placed is upright [rad], still [m/s] and let go on the table for so long [s]."""
+"""Placed: upright to within [rad], slower than [m/s] and released on the table for this long
+[s]."""
 
 WOOD, STEEL, CARDBOARD = (0.72, 0.55, 0.38, 1), (0.35, 0.36, 0.38, 1), (0.78, 0.60, 0.40, 1)
 PALE, MARK, TAPE = (0.82, 0.80, 0.76, 1), (0.12, 0.55, 0.30, 1), (0.90, 0.84, 0.70, 1)
@@ -80,7 +82,7 @@ PALE, MARK, TAPE = (0.82, 0.80, 0.76, 1), (0.12, 0.55, 0.30, 1), (0.90, 0.84, 0.
 class BoxPickAndPlace(Task):
     """Squeeze a box between both hands, lift it, carry it to a table, put it down, let go.
 
-    The box stands on a support before the robot, a step out of its reach; the table is to one
+    The box stands on a support in front of the robot, one step out of reach; the table is to one
     side. Both tops overhang their columns, so that a robot can come close.
     """
 
@@ -109,13 +111,13 @@ class BoxPickAndPlace(Task):
 
     @property
     def hints(self) -> Mapping[str, float]:
-        """How to take hold of the box.
+        """How to grasp the box.
 
-        - `palm_forward`: the palms' sites go so far beyond the box's middle, along the hands: as
-          far as possible, but the arms, which are thicker than the hands, must not touch it.
-        - `palm_outside`: a palm's site is so far outside of the box's side when the hand touches.
-        - `press`: wrist goals go so far further in, which presses the box.
-        - `draw_in`: so far the hands may be drawn in while one walks up to it.
+        - `palm_forward`: offset of the palm sites beyond the box's middle, along the hands: as far
+          as possible without the arms, which are thicker than the hands, touching the box.
+        - `palm_outside`: distance of a palm's site from the box's side in contact.
+        - `press`: additional inward offset of the wrist goals, which squeezes the box.
+        - `draw_in`: distance by which the hands may be drawn in while walking up to it.
         """
         return {
             "palm_forward": min(-self.pad.forward, -self.pad.wrist_end - BOX[0] - WRIST_GAP),
@@ -138,18 +140,18 @@ class BoxPickAndPlace(Task):
         furniture.add_look(spec.body("table"), "spot", "box", mark, (self._spot_offset, 0, 0), MARK)
         box = furniture.add_object_body(spec, "box", BOX[2])
         geom = furniture.add_solid(box, "box", "box", BOX, (0, 0, 0), (0, 0, 0, 0), BOX_FRICTION)
-        look = (BOX[0], BOX[1] - SEEN, BOX[2])
+        look = (BOX[0], BOX[1] - LOOK_INSET, BOX[2])
         furniture.add_look(box, "box_look", "box", look, (0, 0, 0), CARDBOARD)
         geom.mass, geom.condim, geom.priority = BOX_MASS, 4, 1
         geom.solref = COMPLIANCE
         geom.conaffinity = furniture.OBJECT_CONTACT["conaffinity"]
         furniture.add_grip(spec, geom, self._palms, BOX_FRICTION, COMPLIANCE)
-        tape = (0.02, BOX[1] - SEEN + 0.0005, BOX[2] + 0.0005)
+        tape = (0.02, BOX[1] - LOOK_INSET + 0.0005, BOX[2] + 0.0005)
         furniture.add_look(box, "box_tape", "box", tape, (0, 0, 0), TAPE)
 
     @property
     def _spot_offset(self) -> float:
-        """From the middle of the table to the spot, away from the robot [m]."""
+        """Offset of the spot from the middle of the table, away from the robot [m]."""
         return BOX[0] + SPOT - TABLE[0]
 
     def bind(self, plant: Simulation) -> None:
@@ -158,7 +160,7 @@ class BoxPickAndPlace(Task):
         self._touching = Touching(plant, "box")
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Place support and box before the robot, and the table to one side."""
+        """Place support and box in front of the robot, and the table to one side."""
         level = self.reach.height - BOX[2]
         bearing = rng.uniform(-BEARING, BEARING)
         facing = bearing + rng.uniform(-BEARING, BEARING) / 2
@@ -187,7 +189,7 @@ class BoxPickAndPlace(Task):
         self._failure = ""
 
     def update(self) -> TaskStatus:
-        """Whether the box is held up, stands on the table, or is lost."""
+        """Update the status: held up, placed on the table, or dropped."""
         touched, time = self._touching.find(), self.plant.time
         pose = self.plant.get_object_pose("box")
         lift, tilt = pose[2] - self._rest, compute_tilt(pose[3:])
@@ -216,7 +218,7 @@ class BoxPickAndPlace(Task):
         )  # fmt: skip
 
     def _compute_speed(self, time: float, position: np.ndarray) -> float:
-        """Mean speed since the last look; at every instant what stands trembles a little [m/s]."""
+        """Mean speed since the last call [m/s]; the instantaneous one jitters at rest."""
         (before, place), self._seen = self._seen, (time, position)
         if time <= before:
             return compute_speed(self.plant, "box")
@@ -231,7 +233,7 @@ class BoxPickAndPlace(Task):
     def objects(self) -> Mapping[str, SeenObject]:
         """Box, support, table (poses of their middles) and the spot on the table's top.
 
-        X points away from who faces the thing.
+        X points away from a person who faces the object.
         """
         seen = {"box": SeenObject(self.plant.get_object_pose("box"), np.array(BOX))}
         for name, half in (("support", SUPPORT), ("table", TABLE)):

@@ -1,4 +1,4 @@
-"""Dual-point reach: both palms at points of their own, within reach of where the robot stands."""
+"""Dual-point reach: touch two points with both palms, within reach of the standing robot."""
 
 from __future__ import annotations
 
@@ -20,26 +20,25 @@ if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
 
 HOLD_S = 1.0
-"""For how long both palms must be near without a break [s]."""
+"""Time for which both palms must be near without interruption [s]."""
 BEYOND = (0.13, 0.20)
-"""By so much the middle of the points is farther than the palms at rest, over the arm's length."""
+"""Distance of the points' middle beyond the resting palms, relative to the arm length [1]."""
 BEARING_SPREAD = 0.25
-"""By how much the middle is aside, seen from the robot, at most [rad]."""
+"""Largest bearing of the middle from the robot [rad]."""
 HEIGHT_SPREAD = (-0.03, 0.18)
-"""Height of the middle over that of the palms at rest [m]."""
+"""Height of the middle above the resting palms [m]."""
 APART = (0.24, 0.42)
-"""Between the points, seen from above [m]."""
+"""Horizontal distance between the points [m]."""
 LEVEL_SPREAD = 0.07
-"""Largest difference of each point's height from the middle's [m]."""
+"""Largest height difference between a point and the middle [m]."""
 
 
 class DualPointReach(DualPointTouch):
-    """Both palms within 5 cm of their own point, for 1 s without a break, standing.
+    """Both palms within 5 cm of their points, for 1 s without interruption, while standing.
 
-    The small sister of dual-point touch, made for policies that are trained in minutes: the
-    points are before the robot and in its head camera's picture, nobody has to walk, and an
-    episode takes some seconds. How far away a point is varies little, as one small picture hardly
-    shows it.
+    A reduced version of dual-point touch for policies that train in minutes: the points are in
+    front of the robot and in its head camera's image, no walking is needed, and an episode takes a
+    few seconds. The distance of a point varies little, as one small image hardly shows it.
     """
 
     name = "dual_point_reach"
@@ -53,11 +52,11 @@ class DualPointReach(DualPointTouch):
 
     @property
     def height_limits(self) -> Mapping[str, HeightRange]:
-        """None: the points are near where the palms are at rest."""
+        """Empty: the points are near the resting palms."""
         return {}
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Place both points."""
+        """Place both points at random."""
         bearing = rng.uniform(-BEARING_SPREAD, BEARING_SPREAD)
         ahead = self.reach.forward + rng.uniform(*BEYOND) * self.reach.arm
         middle = ahead * make_direction(bearing)

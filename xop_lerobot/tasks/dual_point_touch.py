@@ -1,4 +1,4 @@
-"""Dual-point touch: both palms at points of their own, outside of where the robot stands."""
+"""Dual-point touch: touch two points with both palms, out of reach of the starting robot."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ if TYPE_CHECKING:
     from xop_lerobot.plant.simulation import Simulation
 
 TOLERANCE = 0.05
-"""How near each palm must be to its point [m]."""
+"""Distance within which a palm touches its point [m]."""
 HOLD_S = 3.0
-"""For how long both must be near without a break [s]."""
+"""Time for which both palms must touch without interruption [s]."""
 BEYOND, FARTHEST = 0.5, 1.6
-"""The middle of the points is at least so much farther than the palms at rest, and at most so far
-from where the robot stands at the start [m]."""
+"""Least distance of the points' middle beyond the resting palms, and its largest distance from the
+start [m]."""
 APART = (0.30, 0.45)
-"""Between the points [m]."""
+"""Horizontal distance between the points [m]."""
 HEIGHT_SPREAD = 0.27
-"""Heights of the middle about that of the palms at rest; low ones need a squat [m]."""
+"""Largest height of the middle above or below the resting palms [m]; low ones need a squat."""
 LEVEL_SPREAD, DEPTH_SPREAD = 0.08, 0.04
-"""Largest difference of each point's height and depth from the middle's [m]."""
+"""Largest difference in height and depth between a point and the middle [m]."""
 FACING_SPREAD = 0.6
-"""By how much the points face aside from where the robot sees them at the start [rad]."""
+"""Largest angle between the points' facing direction and their bearing from the start [rad]."""
 NEAR_WALL = (0.25, 0.40)
-"""Distance from a wall, for the points that are near one [m]."""
+"""Distance from the wall, for points near a wall [m]."""
 WALL_SHARE = 0.5
-"""Share of the trials with points near a wall, in a room."""
+"""Share of trials with points near a wall, in a room [1]."""
 ALONG_WALL = 0.9
-"""How far the middle is aside from the middle of the wall, at most [m]."""
+"""Largest distance of the middle from the centre of the wall, along it [m]."""
 CLEAR_OF_WALL = 1.0
-"""Least distance to any wall of the stance that points in the open ask for [m]."""
+"""Least distance from any wall of the standing place for points in the open [m]."""
 
 COLOURS = {"left_point": (0.85, 0.16, 0.14, 1), "right_point": (0.13, 0.33, 0.85, 1)}
 GREY = (0.45, 0.46, 0.48, 1)
 RADIUS, ROD = 0.03, 1.5
-"""Of the balls, and the length of the rods that they are on [m]."""
+"""Radius of the balls, and length of the rods that carry them [m]."""
 
 
 class DualPointTouch(Task):
-    """Both palms within 5 cm of their own point, for 3 s without a break.
+    """Both palms within 5 cm of their points, for 3 s without interruption.
 
-    The points stand so that a robot which faces them has both before it, as its palms are at
-    rest, at another height. In a room half of them are near a wall.
+    The points are placed so that a robot that faces them has both where its palms rest, but at
+    another height. In a room a share of `WALL_SHARE` is near a wall.
     """
 
     name = "dual_point_touch"
@@ -78,11 +78,11 @@ class DualPointTouch(Task):
         return {"points": self.morphology.point_heights or usual}
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
-        """Add two balls that touch nothing, on thin rods for the eye."""
+        """Add two visual balls on thin rods, without collision."""
         for index, (name, colour) in enumerate(COLOURS.items()):
             body = add_furniture_body(spec, name, index)
             add_look(body, name, "sphere", (RADIUS,), (0, 0, 0), colour)
-            # What is under the floor is not seen.
+            # The part of the rod below the floor is hidden.
             add_look(body, f"{name}_rod", "cylinder", (0.004, ROD / 2), (0, 0, -ROD / 2), GREY)
 
     def bind(self, plant: Simulation) -> None:
@@ -92,7 +92,7 @@ class DualPointTouch(Task):
         self._room = find_room(plant.model)
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Place both points."""
+        """Place both points at random."""
         near_wall = self._room is not None and rng.random() < WALL_SHARE
         middle, facing = self._draw_near_wall(rng) if near_wall else self._draw_in_open(rng)
         spread, about = self._compute_level_spread(), self.reach.height
@@ -110,12 +110,12 @@ class DualPointTouch(Task):
         self._success = False
 
     def _compute_level_spread(self) -> float:
-        """Largest difference of a point's height from the middle's [m]."""
+        """Largest height difference between a point and the middle [m]."""
         low, high = self.heights.get("points", (-math.inf, math.inf))
         return min(LEVEL_SPREAD, (high - low) / 2)
 
     def _draw_in_open(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-        """Middle and heading, such that a robot has room to stand before them."""
+        """Draw middle and heading so that a robot has room to stand in front of them."""
         while True:
             bearing = rng.uniform(-math.pi, math.pi)
             middle = rng.uniform(self.reach.forward + BEYOND, FARTHEST) * make_direction(bearing)
@@ -130,7 +130,7 @@ class DualPointTouch(Task):
                 return middle, facing
 
     def _draw_near_wall(self, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-        """Middle and heading, straight at one of the four walls."""
+        """Draw middle and heading, facing one of the four walls."""
         assert self._room is not None
         side = int(rng.integers(4))
         facing = side * math.pi / 2
@@ -150,7 +150,7 @@ class DualPointTouch(Task):
         return distances
 
     def update(self) -> TaskStatus:
-        """Both palms near for long enough is success."""
+        """Update the status: success when both palms have touched long enough."""
         distances = self.compute_distances()
         near = max(distances.values()) <= TOLERANCE
         self._success |= self._hold.update(self.plant.time, near)

@@ -1,4 +1,4 @@
-"""Furniture and objects of a task, added to a model and moved in it."""
+"""Furniture and objects of tasks: adding them to a model, placing and observing them."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ if TYPE_CHECKING:
     from xop_lerobot.plant.simulation import Simulation
 
 PARKING = (30.0, 30.0)
-"""Where everything stands until it is placed, far from any robot [m]."""
+"""Position of everything before it is placed, far from any robot [m]."""
 
 SHORTEST_STEPS = 2
-"""The shortest time constant of a contact, in steps of the simulation."""
+"""Shortest time constant of a contact that MuJoCo accepts [physics steps]."""
 
 SLIDING, TORSION, ROLLING = 0.6, 0.005, 0.0001
-"""Friction of furniture: lacquered wood; MuJoCo's defaults in torsion and rolling."""
+"""Friction of furniture: sliding as of lacquered wood; torsion and rolling are MuJoCo's
+defaults."""
 
 
 def add_furniture_body(spec: mujoco.MjSpec, name: str, index: int = 0) -> mujoco.MjsBody:
-    """Add a body that stands still where it is placed; `index` keeps parked ones apart."""
+    """Add a static body that can be placed; `index` separates parked ones."""
     return spec.worldbody.add_body(
         name=name, mocap=True, pos=(PARKING[0] + 3 * index, PARKING[1], 0)
     )
@@ -37,20 +38,20 @@ def add_furniture_body(spec: mujoco.MjSpec, name: str, index: int = 0) -> mujoco
 def add_object_body(
     spec: mujoco.MjSpec, name: str, height: float, index: int = 0
 ) -> mujoco.MjsBody:
-    """Add a body that moves freely, parked on the floor.
+    """Add a free body, parked on the floor.
 
     Args:
         spec: The model.
         name: Its name.
-        height: Of its frame over the floor where it is parked [m].
-        index: Keeps parked objects apart.
+        height: Height of its frame above the floor while parked [m].
+        index: Separates parked objects.
     """
     body = spec.worldbody.add_body(name=name, pos=(PARKING[0] + 3 * index, PARKING[1] + 6, height))
     body.add_freejoint(name=f"{name}_joint")
     return body
 
 
-def add_solid(  # a geom has as many properties
+def add_solid(
     body: mujoco.MjsBody,
     name: str,
     kind: str,
@@ -59,14 +60,14 @@ def add_solid(  # a geom has as many properties
     colour: tuple[float, ...],
     friction: tuple[float, float, float] = (SLIDING, TORSION, ROLLING),
 ) -> mujoco.MjsGeom:
-    """Add a part of furniture, which meets robots and objects, but no floor and no furniture.
+    """Add a collision geom that touches robots and objects, but no floor or furniture.
 
     Args:
-        body: The furniture.
+        body: Body of the furniture.
         name: Name of the geom.
-        kind: ``"box"``, ``"cylinder"`` or another primitive.
-        size: As MuJoCo takes it [m].
-        pos: Centre in the body [m].
+        kind: ``"box"``, ``"cylinder"`` or another primitive type.
+        size: Size in MuJoCo's convention [m].
+        pos: Centre in the body frame [m].
         colour: Red, green, blue, opacity.
         friction: Sliding, torsional [m], rolling [m].
     """
@@ -92,7 +93,7 @@ def add_look(
     pos: tuple[float, ...],
     colour: tuple[float, ...],
 ) -> mujoco.MjsGeom:
-    """Add something that is seen and touches nothing."""
+    """Add a visual geom without collision or mass."""
     geom = add_solid(body, name, kind, size, pos, colour)
     geom.contype = geom.conaffinity = 0
     geom.mass = 0
@@ -106,19 +107,19 @@ def add_grip(
     friction: tuple[float, float, float],
     compliance: tuple[float, float],
 ) -> None:
-    r"""Let hands hold a solid without its creeping out of them, however soft it is.
+    r"""Let hands hold a solid without slow creep, however soft its contacts are.
 
-    MuJoCo's contacts prescribe :math:`J\dot v = -bv` for what slides in them, without
-    :math:`\dot J v`: a thing that is carried round at ω slides outwards at :math:`\omega^2 r/b`,
-    however hard it is held. With the time constant of a soft contact that is a centimetre a second.
-    So the friction of hands has a time constant of its own, the shortest that MuJoCo takes.
+    MuJoCo's contacts impose :math:`J\dot v = -bv` on sliding, without :math:`\dot J v`: an object
+    carried in a circle at ω slides outwards at :math:`\omega^2 r/b`, however hard it is held. With
+    the time constant of a soft contact that is a centimetre per second. So the friction of hands
+    gets its own time constant, the shortest that MuJoCo accepts.
 
     Args:
         spec: The model.
-        geom: The solid.
-        sites: One on each hand; the hand is the body that carries it, and what hangs on that.
+        geom: The solid's geom.
+        sites: A site on each hand; the hand is the body that carries it, with its descendants.
         friction: Sliding, torsional [m], rolling [m].
-        compliance: Time constant [s] and damping ratio across the contact.
+        compliance: Time constant [s] and damping ratio normal to the contact.
 
     References:
         MuJoCo's documentation, Computation, "Constraint model" (reference acceleration), and
@@ -144,20 +145,20 @@ def add_grip(
 
 
 OBJECT_CONTACT = {"contype": OBJECT_BIT, "conaffinity": FLOOR_BIT | OBJECT_BIT}
-"""Collision bits of an object that moves: it meets the floor, robots and furniture."""
+"""Collision bits of a free object: it touches floor, robots and furniture."""
 
 
 def place(plant: Simulation, name: str, position: np.ndarray, quat: np.ndarray) -> None:
-    """Put furniture somewhere; the caller brings the positions up to date with `settle`.
+    """Place furniture; the caller updates derived positions afterwards with `Simulation.rearrange`.
 
     Args:
         plant: The simulation.
         name: Name of the furniture.
-        position: Where its frame goes [m]. Shape (3,).
-        quat: How it is turned, wxyz. Shape (4,).
+        position: Position of its frame [m]. Shape (3,).
+        quat: Orientation, wxyz. Shape (4,).
 
     Raises:
-        UnknownName: If there is no such furniture; lists what there is.
+        UnknownName: If there is no such furniture; lists the known ones.
     """
     model = plant.model
     known = [model.body(i).name for i in range(model.nbody) if model.body_mocapid[i] >= 0]
@@ -168,13 +169,13 @@ def place(plant: Simulation, name: str, position: np.ndarray, quat: np.ndarray) 
 
 
 def get_body_pose(plant: Simulation, name: str) -> np.ndarray:
-    """True pose of a body, x y z qw qx qy qz. Shape (7,)."""
+    """Return the true pose of a body, x y z qw qx qy qz. Shape (7,)."""
     body = plant.model.body(name).id
     return make_pose(plant.data.xpos[body], plant.data.xquat[body])
 
 
 ROBOT = "robot"
-"""What `Touching.find` calls any part of the robot."""
+"""Name of all parts of the robot in `Touching.find`."""
 
 
 class Touching:
@@ -202,7 +203,7 @@ class Touching:
                 self._names.append(model.body(holder).name)
 
     def find(self) -> set[str]:
-        """Names of furniture, walls, floor and objects that touch it; `robot` for the robot."""
+        """Names of furniture, walls, floor and objects in contact; `robot` for the robot."""
         data = self._data
         if data.ncon == 0:
             return set()
@@ -214,7 +215,7 @@ class Touching:
 
 
 def compute_speed(plant: Simulation, name: str) -> float:
-    """Speed of a free body's middle [m/s]."""
+    """Compute the speed of a body's centre [m/s]."""
     velocity = np.zeros(6)
     body = plant.model.body(name).id
     mujoco.mj_objectVelocity(plant.model, plant.data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
@@ -222,6 +223,6 @@ def compute_speed(plant: Simulation, name: str) -> float:
 
 
 def compute_tilt(quat: np.ndarray) -> float:
-    """Angle between a body's Z axis and the vertical [rad]."""
+    """Compute the angle between a body's Z axis and the vertical [rad]."""
     _, x, y, _ = quat / np.linalg.norm(quat)
     return float(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1)))

@@ -1,4 +1,4 @@
-"""Heights of a task's places, as set by the user."""
+"""Heights of a task's supports and points, as set by the user."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from xop_lerobot.core.command_line import split_pair
 from xop_lerobot.core.errors import BadValue, UnknownName
 
 type HeightRange = tuple[float, float]
-"""Lowest and highest height over the floor [m]."""
+"""Lowest and highest height above the floor [m]."""
 
 _FORM = "NAME=HEIGHT or NAME=LOW:HIGH [m], comma-separated"
 
 
 def parse_heights(text: str) -> dict[str, HeightRange]:
-    """Read heights by name: ``"support=0.35,table=0.6:0.7"``.
+    """Parse heights by name: ``"support=0.35,table=0.6:0.7"``.
 
     Args:
-        text: A height or a range for each name, with commas between; empty for none.
+        text: Comma-separated heights or ranges by name; empty for none.
 
     Raises:
-        BadValue: If it is malformed, or a range is upside down.
+        BadValue: If it is malformed, or a range is reversed.
     """
     heights: dict[str, HeightRange] = {}
     for part in filter(None, (piece.strip() for piece in text.strip("{} ").split(","))):
@@ -44,17 +44,17 @@ def parse_heights(text: str) -> dict[str, HeightRange]:
 def check_heights(
     heights: Mapping[str, HeightRange], limits: Mapping[str, HeightRange], task: str, robot: str
 ) -> None:
-    """Check that a task has these heights, and that a robot can work at them.
+    """Check that a task has these heights, and that the robot can work there.
 
     Args:
-        heights: Ranges by name.
-        limits: Least and greatest height by name.
+        heights: Requested ranges by name.
+        limits: Allowed ranges by name.
         task: Name of the task.
         robot: Name of the robot.
 
     Raises:
         UnknownName: If the task has no such height, listing those that it has.
-        BadValue: If a range goes beyond the limits.
+        BadValue: If a range exceeds its limits.
     """
     for name, (low, high) in heights.items():
         if name not in limits:

@@ -1,4 +1,4 @@
-"""Reach of a robot's hands, and placement of things around it."""
+"""Measures of a robot's hands and arms, and placement of objects around it."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     import mujoco
 
 DRAW_IN = 0.12
-"""Farther than this nobody draws in hands [m]."""
+"""Largest distance by which hands are drawn in [m]."""
 _STEPS, _DT, _NEAR = 50, 0.04, 0.005
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Palms at rest of a standing robot, and the reach of its arms.
+    """Resting palms of a standing robot, and the reach of its arms.
 
     Attributes:
-        forward: Palms ahead of the base's frame [m].
-        height: Palms over the floor [m].
-        shoulder: Shoulders over the floor [m].
-        arm: From the shoulder to the palm, arm stretched [m].
+        forward: Distance of the palms ahead of the base frame [m].
+        height: Height of the palms above the floor [m].
+        shoulder: Height of the shoulders above the floor [m].
+        arm: Length of the stretched arm from shoulder to palm [m].
     """
 
     forward: float
@@ -40,7 +40,7 @@ class Reach:
 
 
 def find_palms(morphology: Morphology, model: mujoco.MjModel) -> dict[str, str]:
-    """Sites of `left_palm` and `right_palm`; the wrist's own where a hand has no palm."""
+    """Sites of `left_palm` and `right_palm`; the wrist's site if a hand has no palm."""
     sites = {model.site(i).name for i in range(model.nsite)}
     palms = {}
     for arm in morphology.arms:
@@ -50,7 +50,7 @@ def find_palms(morphology: Morphology, model: mujoco.MjModel) -> dict[str, str]:
 
 
 def measure_reach(morphology: Morphology) -> Reach:
-    """Measure a robot at its standing posture."""
+    """Measure a robot in its standing posture."""
     model = morphology.build_spec("full").compile()
     data = mujoco.MjData(model)
     data.qpos[:] = morphology.standing_qpos()
@@ -75,7 +75,7 @@ def measure_reach(morphology: Morphology) -> Reach:
 
 
 def make_direction(angle: float) -> np.ndarray:
-    """Unit vector in the ground's plane, `angle` [rad] to the left of X. Shape (3,)."""
+    """Horizontal unit vector at `angle` [rad] to the left of X. Shape (3,)."""
     return np.array([math.cos(angle), math.sin(angle), 0.0])
 
 
@@ -101,9 +101,9 @@ def find_room(model: mujoco.MjModel) -> np.ndarray | None:
 
 
 def measure_draw_in(morphology: Morphology) -> float:
-    """Measure how far the wrists can be drawn in towards the body from where they are at rest [m].
+    """Measure how far the wrists can be drawn in towards the body from rest [m].
 
-    Some arms rest with their elbows as bent as they may be. At most `DRAW_IN`, in three steps.
+    Some arms already rest with their elbows fully bent. At most `DRAW_IN`, in three steps.
     """
     ik = ArmIk(morphology)
     sites = {arm.frame: morphology.frames[arm.frame] for arm in morphology.arms}
@@ -133,12 +133,12 @@ def measure_draw_in(morphology: Morphology) -> float:
 
 @dataclass(frozen=True)
 class Pad:
-    """The side of a hand that presses, in the axes of its palm's site.
+    """Pressing side of a hand, in the frame of its palm site.
 
     Attributes:
-        forward: Middle of the flat of the hand ahead of the site [m].
-        depth: Its surface beyond the site, out of the palm [m].
-        wrist_end: Where the arm ends and the hand begins, ahead of the site [m]; negative.
+        forward: Middle of the flat surface ahead of the site [m].
+        depth: Distance of the surface beyond the site, out of the palm [m].
+        wrist_end: End of the arm and start of the hand, ahead of the site [m]; negative.
     """
 
     forward: float
@@ -147,10 +147,10 @@ class Pad:
 
 
 def measure_pad(morphology: Morphology) -> Pad:
-    """Measure the left hand: the box on it that stands out of the palm the farthest.
+    """Measure the left hand: the box geom that protrudes farthest out of the palm.
 
-    Among boxes that stand out alike (within two centimetres), the largest counts. A hand without
-    boxes has its pad at the palm's site.
+    Of boxes that protrude equally (within two centimetres), the largest counts. A hand without
+    boxes has its pad at the palm site.
     """
     model = morphology.build_spec("full").compile()
     data = mujoco.MjData(model)
@@ -174,23 +174,23 @@ def measure_pad(morphology: Morphology) -> Pad:
     if not pads:
         return Pad(0.0, 0.0, wrist_end)
     farthest = max(pad[0] for pad in pads)
-    alike = [pad for pad in pads if pad[0] > farthest - 0.02]  # in the docstring
+    alike = [pad for pad in pads if pad[0] > farthest - 0.02]  # tolerance of the docstring
     depth, _, forward = max(alike, key=lambda pad: pad[1])
     return Pad(forward, depth, wrist_end)
 
 
 NAME = "task"
 OPEN = ((2.6, -2.2, 1.9), (0.2, 0.1, 0.6), 45.0)
-"""Where the camera is, what it looks at [m], and its vertical field of view [deg]."""
+"""Camera position and target [m], and vertical field of view [deg]."""
 IN_ROOM = ((2.1, -2.1, 2.4), (0.0, 0.0, 0.5), 66.0)
-"""The same in a room of 4.4 m and more: in its corner, under the ceiling."""
+"""The same in a room of at least 4.4 m: in its corner, below the ceiling."""
 
 
 def add_task_camera(spec: mujoco.MjSpec) -> None:
-    """Add the fixed camera `task`."""
+    """Add the static camera `task`."""
     has_walls = any(geom.name.startswith("wall_") for geom in spec.geoms)
     position, target, fovy = IN_ROOM if has_walls else OPEN
-    # MuJoCo's cameras look along -Z with Y up.
+    # MuJoCo's cameras look along -Z, with Y up.
     back = np.subtract(position, target)
     back = back / np.linalg.norm(back)
     right = np.cross([0, 0, 1], back)

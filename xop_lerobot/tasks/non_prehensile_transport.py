@@ -29,41 +29,41 @@ if TYPE_CHECKING:
     from xop_lerobot.plant.simulation import Simulation
 
 TOY = (0.016, 0.012, 0.012)
-"""Half the edges of the toy [m]: 3.2 cm long."""
+"""Half extents of the toy [m]; it is 3.2 cm long."""
 TOY_MASS = 0.05
-"""[kg]"""
+"""Mass of the toy [kg]."""
 TOY_FRICTION = (0.5, 0.003, 0.0001)
-"""Hard rubber: sliding, torsion [m], rolling [m]. It slips on a palm tilted by 27°."""
+"""Friction of hard rubber: sliding [1], torsion [m], rolling [m]. It slips at a tilt of 27°."""
 
 OPENING = (0.05, 0.025)
-"""Half the edges of the container's opening [m]: 10 by 5 cm."""
+"""Half extents of the container's opening [m]: 10 by 5 cm."""
 WALL, DEPTH = 0.008, 0.12
-"""Thickness of the container's walls, and how deep it is [m]."""
+"""Thickness of the container's walls, and its depth [m]."""
 OBSTACLE = (0.02, 0.05)
-"""Half the thickness of the obstacles across the way, and half their breadth along X [m]."""
+"""Half thickness of the obstacles across the path, and half their breadth along X [m]."""
 
 WALK_BEARING = 0.3
-"""Bearing of that way [rad], at most to either side."""
+"""Largest bearing of the required walk, to either side [rad]."""
 AHEAD = (0.0, 0.08)
-"""The opening is so far ahead of the toy at the start [m]."""
+"""Distance of the opening ahead of the toy at the start [m]."""
 FREE, SPREAD = 0.05, 0.04
-"""Free space between hand and obstacle on either side, and what is added at random [m]."""
+"""Gap between hand and obstacle on either side, and its largest random addition [m]."""
 FALL = 0.065
-"""The toy falls so far beyond the edge of the palm that is rolled over [m], as measured."""
+"""Measured distance that the toy falls beyond the edge of the rolled palm [m]."""
 FAR = 0.26
-"""The second obstacle is so far beyond the opening [m]."""
+"""Distance of the second obstacle beyond the opening [m]."""
 RIM = (0.10, 0.06)
-"""Its rim is so far under that palm [m], at most and at least."""
+"""Depth of the rim below the starting palm, largest and least [m]."""
 OVER = (0.02, 0.05)
-"""The tops of the obstacles over that palm [m]."""
+"""Height of the obstacles' tops above the starting palm [m]."""
 
 HELD_S, LEVEL, STILL, CARRIED = 0.5, math.radians(8), 0.05, 0.25
-"""The toy is held on the palm until the palm is level [rad] and still [m/s] for so long [s], or
-moves away by so much [m]."""
+"""The toy is held on the palm until the palm is level to within [rad] and slower than [m/s] for
+this long [s], or has moved by this distance [m]."""
 HELD_AT_LEAST_S = 1.5
-"""And at the start for so long, in which an operator takes over [s]."""
+"""Least time for which it is held at the start, while an operator takes over [s]."""
 INSIDE_S, AT_REST = 0.5, 0.05
-"""Delivered is inside the container, slower than so [m/s], for so long [s]."""
+"""Delivered: inside the container for this long [s], slower than [m/s]."""
 
 ORANGE, BLUE = (0.96, 0.62, 0.10, 1), (0.25, 0.45, 0.72, 1)
 RED, STEEL = (0.78, 0.28, 0.22, 1), (0.35, 0.36, 0.38, 1)
@@ -72,8 +72,8 @@ RED, STEEL = (0.78, 0.28, 0.22, 1), (0.35, 0.36, 0.38, 1)
 class NonPrehensileTransport(Task):
     """Carry a toy that lies loose on the open left palm over obstacles, and drop it into a box.
 
-    The robot begins with the palm up and the toy on it, held there as by a finger until the palm
-    is level and still. Touching an obstacle loses, as does the toy on the floor.
+    The robot starts with the palm up and the toy on it, held in place until the palm is level and
+    still. Touching an obstacle fails the task, as does the toy on the floor.
     """
 
     name = "non_prehensile_transport"
@@ -106,23 +106,23 @@ class NonPrehensileTransport(Task):
 
     @property
     def toy_in_palm(self) -> np.ndarray:
-        """Where the toy lies on the palm, in the axes of the palm's site. Shape (7,)."""
+        """Pose of the toy in the palm site's frame at the start. Shape (7,)."""
         forward, depth = self.pad.forward, self.pad.depth
         if self.has_tray:
             forward = palm.compute_tray_forward(self.pad)
             depth += 2 * palm.TRAY_HALF[2]
-        # The Z of a palm points out of its back; turned up, the toy is on its -Z.
+        # A palm's Z axis points out of the back of the hand, so the toy is on -Z.
         return make_pose(np.array([forward, 0, -depth - TOY[2]]), np.array([0.0, 1, 0, 0]))
 
     @property
     def hints(self) -> Mapping[str, float]:
-        """Where the toy is on the palm and how it falls off.
+        """Position of the toy on the palm, and how it falls off.
 
-        - `toy_forward`, `toy_over`: middle of the toy ahead of the palm's site along the hand,
-          and over it out of the palm.
-        - `edge`: from the middle of the palm to the edge that the toy slides over when the palm
-          is rolled to the right.
-        - `fall`: how far beyond that edge it falls.
+        - `toy_forward`, `toy_over`: middle of the toy ahead of the palm's site along the hand, and
+          above it out of the palm.
+        - `edge`: distance from the middle of the palm to the edge over which the toy slides when
+          the palm rolls to the right.
+        - `fall`: distance that it falls beyond that edge.
         """
         toy = self.toy_in_palm
         return {
@@ -138,7 +138,7 @@ class NonPrehensileTransport(Task):
 
     @property
     def start_arms(self) -> Mapping[str, float]:
-        """Left arm with the palm up before the robot [rad]."""
+        """Left arm angles with the palm up in front of the robot [rad]."""
         return self._start_arms
 
     @cached_property
@@ -174,7 +174,7 @@ class NonPrehensileTransport(Task):
         weld.data[:11] = [0, 0, 0, *self._toy_in_body, 1]
 
     def _add_container(self, spec: mujoco.MjSpec) -> None:
-        """Four walls and a bottom on a column; the frame is in the middle of the rim's plane."""
+        """Add four walls and a bottom on a column; the frame is centred in the rim."""
         body = furniture.add_furniture_body(spec, "container")
         x, y, wall = *OPENING, WALL / 2
         middle = -DEPTH / 2
@@ -191,13 +191,13 @@ class NonPrehensileTransport(Task):
         furniture.add_solid(body, "container_column", "box", column, (0, 0, below), STEEL)
 
     def bind(self, plant: Simulation) -> None:
-        """Find what touches the toy and what holds it."""
+        """Find the contacts of the toy, and the constraint that holds it."""
         self.plant = plant
         self._touching = Touching(plant, "toy")
         self._weld = plant.model.equality("toy_held").id
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Place container and obstacles; the toy is held on the palm."""
+        """Place container and obstacles at random; the toy is held on the palm."""
         bearing = rng.uniform(-WALK_BEARING, WALK_BEARING)
         low, high = self.morphology.work.walk
         walk = rng.uniform(low, high)
@@ -212,7 +212,7 @@ class NonPrehensileTransport(Task):
         forward = self.toy_in_palm[0] + rng.uniform(*AHEAD)
         opening = origin + forward * ahead - across * left
         opening[2] = start[2] - rng.uniform(min(RIM), max(RIM))
-        # Its X axis, along which the opening is 10 cm long, points to the right.
+        # The container's X axis, the long side of its opening, points to the right.
         quat = quat_from_yaw(facing - math.pi / 2)
         furniture.place(self.plant, "container", opening, quat)
         first = origin - obstacle * left
@@ -232,13 +232,13 @@ class NonPrehensileTransport(Task):
         self._success, self._failure = False, ""
 
     def _hold_toy(self) -> None:
-        """Put the toy on the palm and hold it there."""
+        """Place the toy on the palm and hold it there."""
         hand = furniture.get_body_pose(self.plant, self._body)
         self.plant.set_object_pose("toy", pose_multiply(hand, self._toy_in_body))
         self.plant.data.eq_active[self._weld] = 1
 
     def _free_toy(self, palm_pose: np.ndarray) -> None:
-        """Let the toy lie on its own once the palm is level and still, or carries it away."""
+        """Release the toy once the palm is level and still, or has moved by `CARRIED`."""
         time, (last, position) = self.plant.time, self._last_palm
         speed = math.dist(palm_pose[:3], position) / (time - last) if time > last else 0.0
         self._last_palm = (time, palm_pose[:3])
@@ -250,13 +250,13 @@ class NonPrehensileTransport(Task):
             self._free_time = time
 
     def update(self) -> TaskStatus:
-        """Whether the toy is still held, lies on the palm, is in the container, or is lost."""
+        """Update the status: held, on the palm, in the container, or dropped."""
         time, touched = self.plant.time, self._touching.find()
         palm_pose = self.plant.get_site_pose(self._site)
         if self.plant.data.eq_active[self._weld]:
             self._free_toy(palm_pose)
         elif math.isnan(self._let_go_time) and ROBOT not in touched:
-            # Off the palm for good, or it would still be over it.
+            # No contact may be a bounce: it has left the palm only beyond the palm's edge.
             local = pose_multiply(pose_inverse(palm_pose), self.plant.get_object_pose("toy"))
             if math.dist(local[:3], self.toy_in_palm[:3]) > self._edge:
                 self._let_go_time = time
@@ -277,7 +277,7 @@ class NonPrehensileTransport(Task):
         )
 
     def _is_inside(self) -> bool:
-        """Whether the toy's middle is within the walls and under the rim."""
+        """Whether the toy's middle is within the walls and below the rim."""
         container = furniture.get_body_pose(self.plant, "container")
         local = pose_multiply(pose_inverse(container), self.plant.get_object_pose("toy"))[:3]
         return bool((np.abs(local[:2]) < OPENING).all() and -DEPTH < local[2] < 0)

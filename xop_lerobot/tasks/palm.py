@@ -1,4 +1,4 @@
-"""The open left palm: how it is turned up at the start, and what may be fitted to it."""
+"""The open left palm: arm posture that turns it up at the start, and a tray fitted to it."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
 
 PALM_UP = quat_from_rpy(math.pi, 0, 0)
-"""A palm that faces up, fingers forward: Z, out of the back of the hand, points down."""
+"""Orientation of a palm that faces up, fingers forward: Z, out of the back of the hand, is down."""
 TRAY_HALF = (0.05, 0.05, 0.003)
-"""Half the edges of the plate on hands that are no flat surface: along, across, thick [m]."""
+"""Half extents of the tray on hands without a flat palm: along, across, thickness [m]."""
 BARE_EDGE = 0.034
-"""From the middle of a hand without a plate to its edge [m]."""
+"""Distance from the middle of a hand without a tray to its edge [m]."""
 _STEPS, _DT = 150, 0.04
 
 
 def find_start_arms(
     morphology: Morphology, position: np.ndarray, palm_in_wrist: np.ndarray
 ) -> dict[str, float]:
-    """Left arm angles that hold the palm up at `position` while the robot stands.
+    """Find left arm angles that hold the palm up at `position` while the robot stands.
 
     Args:
         morphology: The robot.
-        position: Of the palm's site, robot at the origin, heading along X [m]. Shape (3,).
+        position: Position of the palm's site, robot at the origin, heading along X [m]. Shape (3,).
         palm_in_wrist: Pose of the palm's site in the wrist's frame. Shape (7,).
     """
     arm = morphology.arms[0]
@@ -48,9 +48,9 @@ def find_start_arms(
 
 
 def add_tray(spec: mujoco.MjSpec, site: str, pad: Pad) -> None:
-    """Fix a flat plate of 10 cm by 10 cm without a rim to the palm's side of a hand.
+    """Add a flat plate of 10 cm by 10 cm without a rim to the palm side of a hand.
 
-    Its edge towards the wrist is that of the flat of the hand. It weighs nothing.
+    Its edge towards the wrist is where the hand begins. It has no mass.
     """
     import mujoco  # noqa: PLC0415
 
@@ -75,10 +75,10 @@ def add_tray(spec: mujoco.MjSpec, site: str, pad: Pad) -> None:
 
 
 def compute_tray_forward(pad: Pad) -> float:
-    """Middle of the tray ahead of the palm's site [m]."""
+    """Offset of the tray's middle ahead of the palm's site [m]."""
     return pad.wrist_end + 0.002 + TRAY_HALF[0]
 
 
 def compute_start(reach: Reach, left: float) -> np.ndarray:
-    """Where the palm begins: as at rest, a little nearer and higher. Shape (3,)."""
+    """Start position of the palm: the rest position, slightly nearer and higher. Shape (3,)."""
     return np.array([0.92 * reach.forward, left, reach.height + 0.03])

@@ -22,34 +22,34 @@ if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
 
 AFTER_SUCCESS_S = 1.0
-"""An episode goes on for so long after its success [s]."""
+"""Duration of an episode after its success [s]."""
 
 
 def find_scene(task: Task, scene: str = "") -> str:
-    """Return `scene`, or the one that the task asks for with this robot."""
+    """Return `scene`, or the task's default scene for its robot if empty."""
     return scene or task.choose_scene(task.morphology)
 
 
 class Stage:
-    """A plant with a task's furniture, and the task that looks at it.
+    """A plant with a task's furniture, and the task that judges it.
 
-    The policy loop drives `plant` as any other; after each of its resets `reset` places the
-    furniture, and after each control step `update` tells how far the task is. An episode is over
-    a second after its success, when it is lost, when the robot has fallen, or when the task's
-    time is up.
+    The policy loop drives `plant` like any other. After each of its resets `reset` places the
+    furniture, and after each control step `update` returns the task's status. An episode is over
+    `AFTER_SUCCESS_S` after its success, when it has failed, when the robot has fallen, or when the
+    task's time is up.
 
     Args:
         morphology: The robot.
         task: Name of the task.
-        config: Settings of the plant. Without any, or with an empty `scene`, the task's own
-            scene for the robot.
-        heights: Heights over the task's usual ones; see `Task.choose_heights`.
+        config: Settings of the plant. If missing, or with an empty `scene`, the task's default
+            scene is used.
+        heights: Heights that override the task's defaults; see `Task.choose_heights`.
 
     Attributes:
         plant: The robot among the furniture.
         task: The task.
         scene: Name of the scene.
-        start: Action to begin with: the robot at rest, its arms as the task wants them.
+        start: Start action: the robot at rest, with the task's arm angles.
 
     Raises:
         UnknownName: If there is no such task, height or scene; lists the known ones.
@@ -95,7 +95,7 @@ class Stage:
             self.status = self._judge()
 
     def update(self) -> TaskStatus:
-        """Update the task's status from the physics, once per control step."""
+        """Update the task's status by the physics, once per control step."""
         with self.plant.lock:
             self._note_touches()
             self.status = self._judge()
@@ -103,14 +103,14 @@ class Stage:
 
     @property
     def time(self) -> float:
-        """Time since the episode began [s]."""
+        """Time since the start of the episode [s]."""
         return self.plant.time - self._began
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Walls and furniture, where they stand now, without what hands work over.
+        """Current walls and furniture, except the task's `passable` geoms.
 
-        What hands work at, or have to pass closely, is `handled`.
+        Those that hands work at or pass closely are marked as handled.
         """
         with self.plant.lock:
             near = (*self.task.handled, *self.task.close_by)
@@ -121,7 +121,7 @@ class Stage:
         """What a person could see now.
 
         Args:
-            state: The robot's published state.
+            state: Published state of the robot.
         """
         with self.plant.lock:
             frames = {name: self.plant.get_site_pose(site) for name, site in self._sites.items()}
@@ -138,7 +138,7 @@ class Stage:
         )
 
     def _find_lowest(self) -> dict[str, float]:
-        """The hint `lowest`, where heights are asked for: the least of them [m]."""
+        """The hint `lowest`, if heights are set: the least of them [m]."""
         lows = [low for low, _ in self.task.heights.values()]
         return {"lowest": min(lows)} if lows else {}
 
@@ -147,14 +147,14 @@ class Stage:
         self.plant.close()
 
     def _note_touches(self) -> None:
-        """Record the robot's collisions."""
+        """Record collisions of the robot."""
         handled = set(self.task.handled)
         for part, other in self.plant.take_touches():
             if other in self._solid and not (part in self._hands and other in handled):
                 self._collisions.add((part, other))
 
     def _judge(self) -> TaskStatus:
-        """Verdict of the task, and whether the episode is over."""
+        """Judge the task, and decide whether the episode is over."""
         time, fallen = self.plant.time, self.plant.has_fallen
         collisions = tuple(sorted(self._collisions))
         status = dataclasses.replace(self.task.update(), collisions=collisions)
@@ -174,7 +174,7 @@ class Stage:
 
 
 def _make_start(morphology: Morphology, task: Task) -> RobotAction:
-    """Action at rest, with the arms as the task wants them at the start."""
+    """Rest action with the task's arm angles."""
     rest = morphology.rest_action()
     arms = rest.arms.copy()
     for name, angle in task.start_arms.items():
@@ -183,7 +183,7 @@ def _make_start(morphology: Morphology, task: Task) -> RobotAction:
 
 
 def _make_standing(morphology: Morphology, task: Task) -> np.ndarray:
-    """Standing posture, with the arms as the task wants them. Shape (nq,)."""
+    """Standing posture with the task's arm angles. Shape (nq,)."""
     standing = morphology.standing_qpos()
     if task.start_arms:
         model = morphology.build_spec("planning").compile()
@@ -193,7 +193,7 @@ def _make_standing(morphology: Morphology, task: Task) -> np.ndarray:
 
 
 def _find_hands(plant: Simulation, sites: dict[str, str]) -> set[str]:
-    """Bodies that carry the palms, and all that hang on them."""
+    """Names of the bodies that carry the palms, and of their descendants."""
     model = plant.model
     hands = {int(model.site(sites[palm]).bodyid[0]) for palm in sites if palm.endswith("_palm")}
     for body in range(model.nbody):

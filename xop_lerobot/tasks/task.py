@@ -1,4 +1,4 @@
-"""The interface of a task, and the registry of tasks."""
+"""Interface of a task, and the registry of tasks."""
 
 from __future__ import annotations
 
@@ -21,50 +21,51 @@ if TYPE_CHECKING:
 
 
 class Task(ABC):
-    """A task: furniture and objects around a robot, and a criterion of success.
+    """A task: furniture and objects around a robot, and a success criterion.
 
-    `add_to` puts everything into the robot's full model, `bind` finds it again in the compiled
-    one, `reset` places it at random, and `update` looks at the physics after every control step.
+    `add_to` adds everything to the robot's full model, `bind` finds it in the compiled model,
+    `reset` places it at random, and `update` evaluates the physics after every control step.
 
     Args:
-        morphology: The robot that has to do it; sizes and places are made for its reach.
+        morphology: The robot; sizes and places suit its reach.
     """
 
     name: ClassVar[str]
     instruction: ClassVar[str]
-    """What is to be done, in words; LeRobot's `task` of every frame."""
+    """Task description; LeRobot's `task` of every frame."""
     time_limit: ClassVar[float]
     """Time after which an episode is over [s]."""
     room: ClassVar[str] = "room"
-    """Scene, where none is asked for, of robots that keep clear of walls."""
+    """Default scene of robots that avoid walls."""
 
     furniture: tuple[str, ...] = ()
-    """Bodies that stand still and that a robot may run into."""
+    """Static bodies that the robot may collide with."""
     handled: tuple[str, ...] = ()
     """Those of `furniture` that the hands may touch."""
     close_by: tuple[str, ...] = ()
-    """Those that hands may not touch, but must pass so closely that the person sees to it."""
+    """Those that hands must not touch but pass so closely that avoiding them is left to the
+    operator."""
     ends_on_collision: ClassVar[bool] = False
-    """Whether running into furniture or a wall loses the episode."""
+    """Whether colliding with furniture or a wall fails the episode."""
     passable: tuple[str, ...] = ()
-    """Geoms of `furniture` over which hands work, so that a planner must not keep clear of them."""
+    """Geoms of `furniture` above which hands work, so the planner must not avoid them."""
 
     heights: Mapping[str, HeightRange] = {}
-    """Heights that a user asks for, by name; the others are drawn as usual."""
+    """Heights set by the user, by name; the others are drawn from the task's defaults."""
 
     def __init__(self, morphology: Morphology) -> None:
         self.morphology = morphology
 
     @property
     def height_limits(self) -> Mapping[str, HeightRange]:
-        """Heights that a user may set, by name, with the robot's range [m]."""
+        """Allowed range of each height that a user may set, by name [m]."""
         return {}
 
     def choose_heights(self, text: str) -> None:
-        """Draw places from other heights than usual, from the next `reset` on.
+        """Override the task's default heights, from the next `reset` on.
 
         Args:
-            text: As `parse_heights` reads it.
+            text: Heights in the format of `parse_heights`.
 
         Raises:
             UnknownName: If the task has no such height, listing those that it has.
@@ -82,14 +83,14 @@ class Task(ABC):
         spread: HeightRange,
         margin: float = 0.0,
     ) -> float:
-        """Draw a height over the floor [m].
+        """Draw a height above the floor [m].
 
         Args:
-            rng: Source; one number is drawn of it in either case.
-            name: Of what.
-            about: Height about which it usually is [m].
-            spread: How far below and above it usually is [m].
-            margin: Stay so far within the ends of a range that a user asks for [m].
+            rng: Random generator; exactly one number is drawn in either case.
+            name: Name of the height.
+            about: Centre of the default range [m].
+            spread: Lower and upper offset of the default range [m].
+            margin: Margin to the ends of a range set by the user [m].
         """
         if name in self.heights:
             low, high = self.heights[name]
@@ -103,12 +104,12 @@ class Task(ABC):
 
     @property
     def hints(self) -> Mapping[str, float]:
-        """Hints: knowledge of a practised person, by name; lengths in metres."""
+        """Knowledge of a practised person, by name; lengths [m]."""
         return {}
 
     @property
     def start_arms(self) -> Mapping[str, float]:
-        """Arm joints that are not at rest at the start [rad]."""
+        """Start angles of arm joints that differ from rest [rad]."""
         return {}
 
     @abstractmethod
@@ -117,15 +118,19 @@ class Task(ABC):
 
     @abstractmethod
     def bind(self, plant: Simulation) -> None:
-        """Find what `add_to` added in the compiled model of `plant`."""
+        """Find the bodies of `add_to` in the compiled model of `plant`."""
 
     @abstractmethod
     def reset(self, rng: np.random.Generator) -> None:
-        """Place everything for a new episode, the robot at its start; same draw, same places."""
+        """Place everything for a new episode, with the robot at its start.
+
+        Args:
+            rng: Random generator; equal states give equal places.
+        """
 
     @abstractmethod
     def update(self) -> TaskStatus:
-        """Return the status of the episode from the physics, once per control step."""
+        """Return the status of the episode by the physics, once per control step."""
 
     @property
     @abstractmethod
@@ -152,7 +157,7 @@ def make_task(name: str, morphology: Morphology, heights: str = "") -> Task:
     Args:
         name: Name of the task.
         morphology: The robot.
-        heights: Heights over the task's usual ones; see `Task.choose_heights`.
+        heights: Heights that override the task's defaults; see `Task.choose_heights`.
 
     Raises:
         UnknownName: If there is no such task or height, listing the known ones.
@@ -173,10 +178,10 @@ def get_task(name: str) -> type[Task]:
 
 
 class Hold:
-    """A stopwatch that restarts whenever its condition is not met.
+    """Stopwatch that restarts whenever its condition is not met.
 
     Args:
-        needed: Time for which it has to be met [s].
+        needed: Time for which the condition must be met [s].
     """
 
     def __init__(self, needed: float) -> None:
@@ -189,12 +194,12 @@ class Hold:
         self.duration = 0.0
 
     def update(self, time: float, met: bool) -> bool:
-        """Update with the condition at `time` [s]; return whether it has held for long enough."""
+        """Update with the condition at `time` [s]; return whether it has held long enough."""
         if not met:
             self.reset()
             return False
         if self._since is None:
             self._since = time
         self.duration = time - self._since
-        # Half a physics step absorbs what floating point leaves of sums of 0.02.
+        # Half a physics step of tolerance for rounding in sums of 0.02 s.
         return self.duration >= self.needed - 0.0025
