@@ -110,7 +110,7 @@ def test_inspect(root, monkeypatch):
     out, err = terminal.read()
     assert "1/s2" in out
     assert SPELT in out
-    assert "problem: meta/tasks.parquet has the words of the tasks in a column" in err
+    assert "problem: meta/tasks.parquet has the task descriptions in a column" in err
 
 
 def test_inspect_writes_json_that_is_the_same(root, monkeypatch):

@@ -92,7 +92,7 @@ def test_inspect_names_the_episode(damaged, capsys):
     assert main(["inspect", "--root", str(damaged), "--quiet"]) == 1
     text = capsys.readouterr().err
     assert "file-000.mp4 is damaged: " in text
-    assert "of the 25 pictures of episode 1" in text
+    assert "of the 25 images of episode 1" in text
     assert "of episode 0" not in text
     assert compute_digests(damaged) == before
 
@@ -117,8 +117,8 @@ def test_repair_keeps_the_others(damaged, tmp_path, capsys):
     assert main(["repair", "--root", str(damaged), "--out", str(out), "--quiet"]) == 0
     text = capsys.readouterr().out
     assert "episode 1 is lost: " in text
-    assert "pictures of 'observation.images.top' are damaged" in text
-    assert "whole: 2 episodes, 81 frames. Lost: 1" in text
+    assert "images of 'observation.images.top' are damaged" in text
+    assert "complete: 2 episodes, 81 frames. Lost: 1" in text
 
 
 @given(st.binary(max_size=64))

@@ -153,7 +153,7 @@ def test_out_inside_of_a_source_is_refused(source, tmp_path):
     with pytest.raises(FolderTaken) as caught:
         Destination(other / "deep" / "out", source, other)
     assert str(caught.value) == (
-        f"'{other / 'deep' / 'out'}' is inside of the dataset '{other}'. Choose another --out"
+        f"'{other / 'deep' / 'out'}' is inside the dataset '{other}'. Choose another --out"
     )
 
 

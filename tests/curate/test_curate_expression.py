@@ -86,14 +86,14 @@ def test_unknown_name_lists_the_known_ones():
     with pytest.raises(UnknownName) as caught:
         Expression("success and trackin_p95 < 1", KINDS)
     assert str(caught.value) == (
-        "unknown figure 'trackin_p95'. Did you mean 'tracking_p95'? "
+        "unknown metric 'trackin_p95'. Did you mean 'tracking_p95'? "
         "Known: duration, fall, success, task, tracking_p95"
     )
-    with pytest.raises(UnknownName, match="unknown figure 'true'. Did you mean 'True'?"):
+    with pytest.raises(UnknownName, match="unknown metric 'true'. Did you mean 'True'?"):
         Expression("success == true", KINDS)
     with pytest.raises(UnknownName) as caught:
         Expression("xyzzy", KINDS)
-    assert str(caught.value).startswith("unknown figure 'xyzzy'. Known: duration")
+    assert str(caught.value).startswith("unknown metric 'xyzzy'. Known: duration")
 
 
 @pytest.mark.parametrize(
@@ -114,10 +114,10 @@ def test_unknown_name_lists_the_known_ones():
             "success == 1",
             "'success == 1' compares two kinds: 'success' is yes or no, '1' is a number",
         ),
-        ("task < 'z'", "'task < 'z'' orders what is no number. Known: ==, !="),
+        ("task < 'z'", "'task < 'z'' orders values that are not numbers. Known: ==, !="),
         ("duration == None", "compares with None. Write `is None` or `is not None`"),
-        ("duration is 3", "has `is`, which asks a figure for None alone"),
-        ("tracking_p95 + 1 is None", "has `is`, which asks a figure for None alone"),
+        ("duration is 3", "has `is`, which asks a metric for None alone"),
+        ("tracking_p95 + 1 is None", "has `is`, which asks a metric for None alone"),
         ("0 < duration is None", "compares with None. Write `is None` or `is not None`"),
         ("0 < duration in (1, 2)", "'(1, 2)' cannot be written here"),
         ("0 < duration is 3", "has `in` or `is` in a chain. Write each comparison alone"),

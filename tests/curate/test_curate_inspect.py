@@ -271,9 +271,9 @@ def test_json_that_cannot_be_written(made, tmp_path, capsys):
 def test_unknown_figure_is_refused(made, capsys):
     assert main(["inspect", "--root", str(made), "--show", "episode,trackin_p95"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("error: unknown figure 'trackin_p95'. Did you mean 'tracking_p95'? Known")
+    assert err.startswith("error: unknown metric 'trackin_p95'. Did you mean 'tracking_p95'? Known")
     assert main(["inspect", "--root", str(made), "--show", " , "]) == 2
-    assert "--show must name figures" in capsys.readouterr().err
+    assert "--show must name metrics" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -309,7 +309,7 @@ def test_usage_errors(made, capsys):
         ("inspect", "--rot", "x", "--root", "y"): "unknown flag of xop-curate inspect '--rot'. "
         "Known: --help, --json, --quiet, --root, --show",
         ("inspect", "--rot", "x"): "unknown flag of xop-curate inspect '--rot'. Known: --help",
-        ("filter", "--root", str(made), "--where", "success"): "say where the new dataset goes: "
+        ("filter", "--root", str(made), "--where", "success"): "missing output: pass "
         "--out=DIR, --in-place, or --dry-run",
         ("filter", "--root", str(made), "--where", "success", "--out", "x", "--in-place"): "--out "
         "and --in-place exclude each other",
@@ -401,7 +401,7 @@ def test_unknown_is_left_out_or_kept(foreign, tmp_path, capsys):
 def test_expression_is_checked_before_anything_is_read(tmp_path, capsys):
     flags = ["filter", "--root", str(tmp_path), "--dry-run", "--where"]
     assert main([*flags, "sucess"]) == 2
-    assert "unknown figure 'sucess'. Did you mean 'success'?" in capsys.readouterr().err
+    assert "unknown metric 'sucess'. Did you mean 'success'?" in capsys.readouterr().err
     assert main([*flags, "duration"]) == 2
     assert "must be yes or no" in capsys.readouterr().err
 
@@ -488,7 +488,7 @@ def test_ctrl_c_leaves_everything_as_it_was(data, capsys, monkeypatch):
     monkeypatch.setattr(Expression, "evaluate", interrupt_at(3))
     flags = ["filter", "--root", str(data), "--where", "duration > 0"]
     assert main([*flags, "--in-place"]) == 130
-    assert capsys.readouterr().err == "stopped; nothing was changed\n"
+    assert capsys.readouterr().err == "interrupted; nothing was changed\n"
     monkeypatch.setattr(Expression, "evaluate", interrupt_at(3))
     assert main([*flags, "--out", str(data.parent / "deep" / "out")]) == 130
     assert compute_digests(data) == before

@@ -122,7 +122,7 @@ def test_entries_of_rules(base):
     [
         ("robot_head_z < 1", BadValue, "--subtask takes NAME=EXPRESSION"),
         ("down=", BadValue, "--subtask takes NAME=EXPRESSION"),
-        ("down=robot_head_zz < 1", UnknownName, "unknown figure 'robot_head_zz'. Did you mean"),
+        ("down=robot_head_zz < 1", UnknownName, "unknown metric 'robot_head_zz'. Did you mean"),
         ("down=robot_head_z", BadValue, "expression 'robot_head_z': 'robot_head_z' is a number"),
     ],
 )
@@ -136,7 +136,7 @@ def test_bad_rules(base, text, error, message):
 def test_one_way_at_a_time(base, tmp_path, capsys, flags):
     run(base, tmp_path / "out", *flags, code=2)
     assert capsys.readouterr().err == (
-        "error: give rules (--success, --subtask), --labels or --by-hand, and one of them\n"
+        "error: pass exactly one of: rules (--success, --subtask), --labels, --by-hand\n"
     )
 
 
@@ -237,7 +237,7 @@ def test_session_goes_back_and_refuses(tmp_path):
     assert session.message == "there is no sub-task 3. Known: 1 reach"
     for word in ("1", "1 soon", "1 -2"):
         session.press(word)
-        assert session.message == "say when it begins [s], such as '1 1.5'"
+        assert session.message == "missing start time [s], such as '1 1.5'"
     assert session.current == 7
 
 
@@ -274,4 +274,4 @@ def test_images_of_a_strip(filmed):
 
 def test_no_pictures_to_show(base, tmp_path, capsys):
     run(base, tmp_path / "out", "--by-hand", str(tmp_path / "l.json"), code=1)
-    assert "episode 0 has no pictures to show" in capsys.readouterr().err
+    assert "episode 0 has no images to show" in capsys.readouterr().err

@@ -118,7 +118,7 @@ def test_a_cell_that_says_nothing(bases, tmp_path, capsys, cell, one_file):
     code, said, _ = curate(capsys, "repair", "--root", root, "--out", mended)
     assert code == 0
     assert text in said
-    assert "whole: 4 episodes, 46 frames. Lost: 0" in said
+    assert "complete: 4 episodes, 46 frames. Lost: 0" in said
     assert read_numbers(mended) == expect(0, 1, 2, 3)
     assert compute_digests(root) == before
 
@@ -136,7 +136,7 @@ def test_verbs_that_mend_nothing_stop_at_it(packed, tmp_path, capsys, verb):
     assert code == 1
     assert err.splitlines()[-1].startswith(
         f"error: dataset '{packed}': meta/episodes must give '{VIDEO}to_timestamp' of episode 1 as "
-        "a time [s] of 0 or more, got nan. `xop-curate repair` keeps what is whole"
+        "a time [s] of 0 or more, got nan. `xop-curate repair` keeps what is complete"
     )
     assert not out.exists()
 
@@ -151,7 +151,7 @@ def test_episode_without_a_number(packed, tmp_path, capsys):
     ) in err
     code, said, _ = curate(capsys, "repair", "--root", packed, "--out", tmp_path / "out")
     assert code == 0
-    assert "episode 1 is not in meta/episodes: made anew\n" in said
+    assert "episode 1 is not in meta/episodes: rebuilt\n" in said
     assert read_numbers(tmp_path / "out") == expect(0, 1, 2, 3)
 
 
@@ -164,7 +164,7 @@ def test_what_is_not_known_of_a_neighbour_is_not_guessed(packed, tmp_path, capsy
     pq.write_table(table.filter(pa.array(~gone)), rows)
     code, said, _ = curate(capsys, "repair", "--root", packed, "--out", tmp_path / "out")
     assert code == 0
-    assert "episode 2 is lost: its pictures are gone\n" in said
+    assert "episode 2 is lost: its images are gone\n" in said
     assert read_numbers(tmp_path / "out") == expect(0, 3)
 
 
@@ -191,7 +191,7 @@ def test_shared_pictures_are_named_and_not_handed_on(single, tmp_path, capsys):
     share(single, file_index=1)
     code, problems, err = inspect(single, capsys)
     text = (
-        f"the episodes 1 and 2 have the same pictures of '{CAMERA}', "
+        f"the episodes 1 and 2 have the same images of '{CAMERA}', "
         f"videos/{CAMERA}/chunk-000/file-001.mp4 from 0.00 s to 1.00 s"
     )
     assert (code, problems) == (1, {0: [], 1: [text], 2: [text], 3: []})
@@ -208,7 +208,7 @@ def test_repair_gives_the_pictures_back(single, tmp_path, capsys):
     share(single, file_index=1)
     code, said, _ = curate(capsys, "repair", "--root", single, "--out", tmp_path / "out")
     assert code == 0
-    assert "the pictures of episode 2 are found: " in said
+    assert "the images of episode 2 are found: " in said
     assert read_numbers(tmp_path / "out") == expect(0, 1, 2, 3)
 
 
@@ -229,7 +229,7 @@ def test_shared_pictures_without_others_are_lost(single, tmp_path, capsys):
     (single / f"videos/{CAMERA}/chunk-000/file-002.mp4").unlink()
     code, said, _ = curate(capsys, "repair", "--root", single, "--out", tmp_path / "out")
     assert code == 0
-    assert "episode 2 is lost: the episodes 1 and 2 have the same pictures" in said
+    assert "episode 2 is lost: the episodes 1 and 2 have the same images" in said
 
 
 # Numbers.
@@ -249,8 +249,8 @@ def test_gap_of_numbers(packed, tmp_path, capsys):
     assert code == 1
     assert problems[0] == []
     assert problems[3][0] == (
-        "episode 3 comes after 0, but LeRobot takes episodes to be numbered from 0 without a gap. "
-        "`xop-curate filter` counts anew"
+        "episode 3 comes after 0, but LeRobot assumes episodes numbered from 0 without gaps. "
+        "`xop-curate filter` renumbers it"
     )
     out, mended = tmp_path / "out", tmp_path / "mended"
     assert curate(capsys, "filter", "--root", packed, "--out", out, "--where", "readable")[0] == 0
@@ -268,15 +268,15 @@ def test_gap_of_numbers(packed, tmp_path, capsys):
 COUNTERS = {
     "timestamp": (
         lambda old: old + 1.7e9,
-        "'timestamp' of episode 0 must be 0 in row 0, it is 1700000000. `xop-curate filter` counts",
+        "'timestamp' of episode 0 must be 0 in row 0, it is 1700000000. `xop-curate filter` renumb",
     ),
     "index": (
         lambda old: old + 5,
-        "'index' of episode 0 must be 0 in row 0, it is 5. `xop-curate filter` counts anew",
+        "'index' of episode 0 must be 0 in row 0, it is 5. `xop-curate filter` renumbers it",
     ),
     "frame_index": (
         lambda old: old + 1,
-        "'frame_index' of episode 0 must be 0 in row 0, it is 1. `xop-curate filter` counts anew",
+        "'frame_index' of episode 0 must be 0 in row 0, it is 1. `xop-curate filter` renumbers it",
     ),
 }
 
@@ -314,15 +314,15 @@ def test_offsets_that_are_scrambled(packed, tmp_path, capsys):
     code, problems, _ = inspect(packed, capsys)
     assert code == 1
     assert problems[1] == [
-        "episode 1 is said to be the rows 0 to 24 of the dataset, it is the rows 14 to 24. "
-        "`xop-curate filter` counts anew"
+        "the metadata puts episode 1 at the rows 0 to 24, it is the rows 14 to 24. "
+        "`xop-curate filter` renumbers it"
     ]
     out = tmp_path / "out"
     assert curate(capsys, "filter", "--root", packed, "--out", out, "--where", "readable")[0] == 0
     assert inspect(out, capsys)[0] == 0
     code, said, _ = curate(capsys, "repair", "--root", packed, "--dry-run")
-    assert "nothing is wrong" not in said
-    assert "episode 1 is said to be the rows 0 to 24 of the dataset" in said
+    assert "no damage found" not in said
+    assert "the metadata puts episode 1 at the rows 0 to 24" in said
 
 
 def test_words_of_another_task(packed, capsys):
@@ -389,7 +389,7 @@ def test_repair_says_what_it_mends(single, tmp_path, capsys):
     assert code == 0
     assert said.startswith(
         "episode 1 is in data/chunk-000/file-001.parquet, and not in "
-        "data/chunk-000/file-000.parquet, as meta/episodes says: mended\n"
+        "data/chunk-000/file-000.parquet, as meta/episodes says: repaired\n"
     )
     assert read_numbers(tmp_path / "out") == expect(0, 1, 2, 3)
 
@@ -398,7 +398,7 @@ def test_repair_finds_a_video_that_is_named_wrongly(single, tmp_path, capsys):
     edit(single, {VIDEO + "file_index": {1: 7}})
     code, said, _ = curate(capsys, "repair", "--root", single, "--out", tmp_path / "out")
     assert code == 0
-    assert "the pictures of episode 1 are found: " in said
+    assert "the images of episode 1 are found: " in said
     assert read_numbers(tmp_path / "out") == expect(0, 1, 2, 3)
 
 
@@ -406,5 +406,5 @@ def test_repair_of_what_is_whole(bases, capsys):
     for root in bases.values():
         code, said, _ = curate(capsys, "repair", "--root", root, "--dry-run")
         assert (code, said) == (
-            0, "nothing is wrong with it\nwhole: 4 episodes, 46 frames. Lost: 0\n",
+            0, "no damage found\ncomplete: 4 episodes, 46 frames. Lost: 0\n",
         )  # fmt: skip

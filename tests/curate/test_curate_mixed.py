@@ -207,7 +207,7 @@ def test_repair(mixed, tmp_path, capsys):
     assert main(["repair", "--root", str(mixed / "killed"), "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "of an unfinished episode: left out" in said
-    assert "whole: 3 episodes" in said
+    assert "complete: 3 episodes" in said
     dataset = load("local/out", root=out)
     assert dataset.num_episodes == 3
     dataset[len(dataset) - 1]

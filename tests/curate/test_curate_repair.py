@@ -107,9 +107,9 @@ def test_killed_session(killed, whole, tmp_path, capsys):
     assert compute_digests(killed) == before
     check_episodes(tmp_path / "out", whole, [0, 1, 2])
     assert said == (
-        "meta/episodes has nothing readable: made anew of rows and pictures\n"
-        f"images/{CAMERA}/episode-000003 holds 12 pictures of an unfinished episode: left out\n"
-        "whole: 3 episodes, 106 frames. Lost: 0\n"
+        "meta/episodes has nothing readable: rebuilt from rows and images\n"
+        f"images/{CAMERA}/episode-000003 holds 12 images of an unfinished episode: left out\n"
+        "complete: 3 episodes, 106 frames. Lost: 0\n"
         f"written to {tmp_path.resolve()}/out\n"
     )
     steps = [row["provenance"][-1] for row in read_facts(tmp_path / "out")]
@@ -177,7 +177,7 @@ def test_rows_that_are_cut_off(tmp_path, capsys):
     said = repair(root, tmp_path / "out", capsys)
     assert f"{DATA} is not readable (Parquet magic bytes not found in footer" in said
     assert "episode 0 is lost: its rows are gone\n" in said
-    assert "whole: 1 episode, 24 frames. Lost: 1\n" in said
+    assert "complete: 1 episode, 24 frames. Lost: 1\n" in said
     rows, expected = read_rows(tmp_path / "out", 0), read_rows(whole, 1)
     np.testing.assert_array_equal(np.stack(rows["action"]), np.stack(expected["action"]))
 
@@ -187,7 +187,7 @@ def test_video_that_is_cut_off(whole, tmp_path, capsys):
     cut(root / VIDEO, 0.8)
     said = repair(root, tmp_path / "out", capsys)
     check_episodes(tmp_path / "out", whole, [0, 1])
-    assert f"of its 44 pictures of '{CAMERA}' are gone\n" in said
+    assert f"of its 44 images of '{CAMERA}' are gone\n" in said
     assert said.startswith("meta/info.json counts 3 episodes, 2 are whole\nepisode 2 is lost: ")
 
 
@@ -217,7 +217,7 @@ def test_tasks_are_found_again(whole, tmp_path, capsys):
     cut(root / "meta/tasks.parquet", 0.5)
     said = repair(root, tmp_path / "out", capsys)
     check_episodes(tmp_path / "out", whole, [0, 1, 2])
-    assert "meta/tasks.parquet is not readable: made anew of what the episodes say\n" in said
+    assert "meta/tasks.parquet is not readable: rebuilt from what the episodes say\n" in said
 
 
 def test_nothing_to_restore(whole, tmp_path, capsys):
@@ -226,12 +226,12 @@ def test_nothing_to_restore(whole, tmp_path, capsys):
     capsys.readouterr()
     assert main(["repair", "--root", str(root), "--out", str(tmp_path / "out")]) == 1
     out, err = capsys.readouterr()
-    assert out.count("is lost: its pictures") == 3
+    assert out.count("is lost: its images") == 3
     assert err == "error: no episode is left, so no dataset is made\n"
     assert [path.name for path in tmp_path.iterdir()] == ["packed"]
 
 
 def test_whole_dataset_stays_as_it_is(whole, tmp_path, capsys):
     said = repair(whole, tmp_path / "out", capsys)
-    assert said.startswith("nothing is wrong with it\nwhole: 3 episodes, 106 frames. Lost: 0\n")
+    assert said.startswith("no damage found\ncomplete: 3 episodes, 106 frames. Lost: 0\n")
     check_episodes(tmp_path / "out", whole, [0, 1, 2])

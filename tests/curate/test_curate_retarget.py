@@ -349,7 +349,7 @@ def test_nothing_that_can_be_replayed(source, tmp_path, capsys):
         (["--weights", "colour=1"], 2, "unknown weight 'colour'. Known: change, collision, "),
         (["--robot=h1"], 2, "unknown robot 'h1'. Known: "),
         (["--task=sleep"], 2, "unknown task 'sleep'. Known: "),
-        (["--weights", "position=2"], 2, "a retargeter 'direct' has none. Use --method=mpc, or"),
+        (["--weights", "position=2"], 2, "the retargeter is 'direct'. Use --method=mpc, or"),
         (["--colour=red"], 2, "unknown flag of xop-curate retarget '--colour=red'. Known: --al"),
     ],
 )
@@ -367,7 +367,7 @@ def test_places_that_are_taken(source, made, tmp_path, capsys):
         "choose another --out, or delete it\n"
     )
     assert main(["retarget", f"--root={source}", *FLAGS]) in (1, 2)
-    assert "say where the new dataset goes: --out=DIR, or --dry-run" in capsys.readouterr().err
+    assert "missing output: pass --out=DIR, or --dry-run" in capsys.readouterr().err
     other = tmp_path / "other"
     shutil.copytree(source, other)
     (other / "meta/xop/retarget.json").unlink()
@@ -438,7 +438,7 @@ def test_settings_are_read_by_their_type():
 def test_choices():
     assert parse_episodes("8-11, 3,9") == [3, 8, 9, 10, 11]
     assert parse_episodes("8:11,9-12,3") == [3, 8, 9, 10, 11, 12]
-    with pytest.raises(BadValue, match="--episodes has '11-8', which names none, in '3,11-8'"):
+    with pytest.raises(BadValue, match="--episodes has '11-8', an empty range, in '3,11-8'"):
         parse_episodes("3,11-8")
     assert [choose_fps(0, fps) for fps in (25, 50, 30, 12.5, 10)] == [25, 50, 25, 25, 10]
     assert choose_fps(5, 30) == 5

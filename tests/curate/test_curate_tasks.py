@@ -126,12 +126,12 @@ def test_operator_with_several_tasks_is_retargeted_with_their_words(tmp_path):
     [
         (
             pa.table({"task_index": NUMBERS, "task": NUMBERS}),
-            "must have one column of text, the words of the tasks, beside task_index. "
+            "must have one text column, the task descriptions, beside task_index. "
             "Its columns: task_index, task",
         ),
         (
             pa.table({"task_index": NUMBERS, "a": WORDS, "b": WORDS}),
-            "must have one column of text, the words of the tasks, beside task_index. "
+            "must have one text column, the task descriptions, beside task_index. "
             "Its columns: task_index, a, b",
         ),
         (

@@ -302,9 +302,7 @@ def test_clips_that_are_none(recorded):
         entry = next(source.episodes)
         with pytest.raises(BadValue) as error:
             Clip(source, entry, (20, 31))
-        assert str(error.value) == (
-            "episode 0 has the rows 0 to 30; there is nothing from 20 to 31"
-        )
+        assert str(error.value) == ("episode 0 has the rows 0 to 30; got 20 to 31")
         with pytest.raises(BadShape):
             Clip(source, entry, (0, 10), columns={"action": np.zeros((30, 2))})
 
@@ -318,7 +316,7 @@ def test_pictures_that_are_missing_are_refused(tmp_path):
     with pytest.raises(BadDataset) as error:
         copy_clips(root, tmp_path / "bad", [(2, None)])
     assert "file-000.mp4 lacks " in str(error.value)
-    assert "of the 44 pictures from 3.100 s on, at 20 Hz" in str(error.value)
+    assert "of the 44 images from 3.100 s on, at 20 Hz" in str(error.value)
 
 
 def test_missing_pictures_are_counted():

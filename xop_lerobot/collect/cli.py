@@ -3,10 +3,10 @@ r"""`xop-collect`: unattended collection of LeRobot datasets with success labels
     xop-collect --robot g1 --task box_pick_and_place --episodes 50 --seed 0 \
         --root outputs/boxes --repo-id me/boxes
 
-A simulated operator does the task over and over, headless and in as many processes as there are
-cores. Episode i is the same whatever their number. Ctrl-C, SIGTERM and `kill -9` lose only the
-episodes under way: the same command again goes on, and with more `--episodes` adds to a dataset.
-The last line of standard output is one JSON object.
+A simulated operator repeats the task, headless, in one process per core. Episode i is the same for
+any number of processes. Ctrl-C, SIGTERM and `kill -9` lose only unfinished episodes: the same
+command resumes, and with more `--episodes` it extends a dataset. The last line of standard output
+is one JSON object.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from xop_lerobot.collect.config import CollectConfig, add_config, add_crew, read_config
+from xop_lerobot.collect.config import CollectConfig, add_config, add_worker_flags, read_config
 from xop_lerobot.collect.folder import CollectFolder
 from xop_lerobot.collect.run import WorkerFailed, run_collection
 from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, make_output_readable
@@ -32,11 +32,11 @@ class CollectResult:
     """Outcome of a collection.
 
     Attributes:
-        episodes: Episodes that were run, of this and of all runs before.
-        successes: Those in which the task was accomplished.
+        episodes: Number of episodes of this and all earlier runs.
+        successes: Number of successful ones.
         frames: Frames of the dataset.
-        sim_s: Simulated time of all episodes, without the settling before them [s].
-        wall_s: Time that all runs took, each killed one until its last finished episode [s].
+        sim_s: Simulated time of all episodes, without settling [s].
+        wall_s: Duration of all runs, each killed one until its last finished episode [s].
         root: Directory of the dataset.
     """
 
@@ -59,15 +59,15 @@ def collect(
     """Collect a dataset, or its missing episodes.
 
     Args:
-        config: What is collected.
+        config: Configuration.
         root: Directory of the dataset.
-        episodes: How many episodes there shall be.
+        episodes: Total number of episodes.
         repo_id: Name of the dataset; empty for `local/` and the directory's name.
-        workers: Number of workers; 0 for one for each core.
-        ray: Address of a Ray cluster that makes them; empty for processes of this machine.
+        workers: Number of workers; 0 for one per core.
+        ray: Address of a Ray cluster; empty for processes of this machine.
 
     Raises:
-        XopError: If a setting is not valid, the directory is taken, or an episode fails.
+        XopError: If a setting is invalid, the directory is taken, or an episode fails.
     """
     for name, value, low in (("episodes", episodes, 1), ("workers", workers, 0)):
         if value < low:
@@ -107,7 +107,7 @@ def make_parser() -> CommandParser:
         default="",
         help="name of the dataset; empty: local/<directory> (default: none)",
     )
-    add_crew(parser)
+    add_worker_flags(parser)
     add_config(parser)
     device = CollectConfig.device
     add(
@@ -115,7 +115,7 @@ def make_parser() -> CommandParser:
         default=device,
         help=f"operator device: simulated, or one of a plugin (default: {device})",
     )
-    add("--only-successful", action="store_true", help="leave failed episodes out of the dataset")
+    add("--only-successful", action="store_true", help="do not save failed episodes")
     return parser
 
 
@@ -123,7 +123,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[CollectConfig, argparse.N
     """Read the command line.
 
     Raises:
-        BadValue: If a flag is absent or malformed.
+        BadValue: If a flag is missing or malformed.
         UnknownName: If one is unknown, listing the known ones.
     """
     args = make_parser().parse(arguments)

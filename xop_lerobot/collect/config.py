@@ -24,27 +24,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """Everything that determines a dataset's content; equal configurations give equal episodes.
+    """Everything that decides the content of a dataset; equal configurations give equal episodes.
 
     Attributes:
-        robot: Name of the robot's morphology, `g1` for one.
+        robot: Name of the robot's morphology, such as `g1`.
         task: Name of the task.
-        seed: Seed of the session; with the episode's index it decides all that is random.
-        cameras: Cameras that are recorded.
+        seed: Seed of the session; with the episode's index it seeds all randomness.
+        cameras: Recorded cameras.
         low_level: Low-level policy; `default` is the robot's own.
         low_level_path: Its file; empty for its default.
-        fps: Rate of the control loop and of the dataset [Hz].
-        width: Width of a picture [pixel].
-        height: Height of a picture [pixel].
-        noise: Preset of the sensors' noise.
-        method: How the operator's motion becomes commands: `mpc`, `direct`, …
-        variant: Variant of it: a binding, constraints and a preset, with `_` between.
-        only_successful: Whether episodes that did not succeed are left out.
-        video: Whether pictures are stored as h264 video, else as PNG.
-        scene: Scene that the robot stands in; empty takes the task's own.
-        heights: Heights over the task's usual ones; see `Task.choose_heights`.
+        fps: Rate of control loop and dataset [Hz].
+        width: Image width [px].
+        height: Image height [px].
+        noise: Preset of the sensor noise.
+        method: Method of retargeting: `mpc`, `direct`, …
+        variant: Its variant: a binding, constraints and a preset, joined by `_`.
+        only_successful: Whether failed episodes are left out.
+        video: Whether images are stored as H.264 video, else as PNG.
+        scene: Scene; empty for the task's own.
+        heights: Heights that override the task's defaults; see `Task.choose_heights`.
         device: Operator device that drives the robot.
-        plugins: Modules that are imported first, and may register robots, tasks and devices.
+        plugins: Modules to import first, which may register robots, tasks and devices.
     """
 
     robot: str
@@ -67,11 +67,12 @@ class CollectConfig:
     plugins: tuple[str, ...] = ()
 
     maker: ClassVar[str] = "xop_lerobot.collect.worker:Collector"
-    """Class that makes the episodes in a worker, from the configuration and when the run began
-    [s since the epoch]; it brings torch, which who only asks for a plan can do without."""
+    """Class that makes the episodes in a worker, called with the configuration and the start time
+    of the run [s since the epoch]. Named, not imported: it imports torch, which planning a run does
+    not need."""
 
     def check(self) -> None:
-        """Check all that can be checked before a robot is made; imports the plugins.
+        """Check everything that does not need a robot; imports the plugins.
 
         Raises:
             UnknownName: If there is no such robot, task, height, policy, noise, method or device.
@@ -85,10 +86,10 @@ class CollectConfig:
         make_device(self.make_teleop_config().device)
 
     def to_settings(self) -> dict[str, Any]:
-        """Return what must be the same for two runs to work on one dataset, fit for JSON."""
+        """Return the settings that runs on one dataset must share, as plain values for JSON."""
         settings = dataclasses.asdict(self)
         del settings["plugins"]
-        if not self.heights:  # as in collections that were made before there were any
+        if not self.heights:  # equal to collections from before heights existed
             del settings["heights"]
         return {**settings, "cameras": list(self.cameras)}
 
@@ -147,8 +148,8 @@ class CollectConfig:
     def make_teleop_config(self) -> XopConfig:
         """Make the configuration of the teleoperator as a LeRobot device.
 
-        The rollouts take one thread: the workers share the cores among them, and the episodes
-        come out the same, configuration included, with any number of workers.
+        Rollouts take one thread: the workers share the cores, and episodes are the same, including
+        the configuration, with any number of workers.
 
         Raises:
             BadValue: If the variant contradicts the method.
@@ -167,7 +168,7 @@ class CollectConfig:
 
 
 def import_plugins(names: tuple[str, ...]) -> None:
-    """Import the user's own modules.
+    """Import user modules.
 
     Raises:
         BadValue: If one cannot be found.
@@ -187,12 +188,12 @@ def import_plugins(names: tuple[str, ...]) -> None:
 def add_config(
     parser: CommandParser, kind: type[CollectConfig] = CollectConfig, **texts: str
 ) -> None:
-    """Add the flags that configure the simulation of an episode, except robot and task.
+    """Add the flags of the configuration, except robot and task.
 
     Args:
         parser: Parser of the command.
-        kind: Configuration whose defaults are shown.
-        texts: What the help says of a flag instead.
+        kind: Configuration class that defines the defaults.
+        texts: Help texts that replace the usual ones, by flag.
     """
     defaults = {each.name: each.default for each in fields(kind) if each.default is not MISSING}
 
@@ -200,7 +201,7 @@ def add_config(
         default = defaults[name.replace("-", "_")]
         shown = ",".join(default) if isinstance(default, tuple) else default
         text = texts.get(name) or f"{text} (default: {'none' if shown == '' else shown})"
-        if default == "":  # "none" is what the help says of it
+        if default == "":  # shown as "none" in the help, so accept that word
             options.setdefault("type", find_text)
         parser.add_argument(f"--{name}", help=text, default=default, **options)
 
@@ -208,21 +209,21 @@ def add_config(
     add("cameras", "cameras, comma-separated", type=split)
     add("low-level", "low-level policy; default: the robot's own")
     add("low-level-path", "file of the low-level policy; empty: its default")
-    add("fps", "rate of control and dataset [Hz]; divides 50", type=int)
+    add("fps", "rate of control and dataset [Hz], a divisor of 50", type=int)
     add("width", "image width [pixel]", type=int)
     add("height", "image height [pixel]", type=int)
     add("noise", "sensor noise: off, mild or harsh")
     add("method", "mpc, mpc_no_sync, mpc_table1, direct or direct_amo")
-    add("variant", "binding, constraints and preset with _ between, such as v2_upright")
+    add("variant", "binding, constraints and preset joined by _, such as v2_upright")
     add("scene", "scene; empty: the task's own")
-    add("heights", "heights over the task's own, as support=0.35,table=0.6:0.7 [m]")
+    add("heights", "heights that override the task's, such as support=0.35,table=0.6:0.7 [m]")
     add("plugins", "modules to import first, comma-separated", type=split)
     parser.add_argument(
         "--images", action="store_true", help="store images as PNG instead of h264 video"
     )
 
 
-def add_crew(parser: CommandParser) -> None:
+def add_worker_flags(parser: CommandParser) -> None:
     """Add `--workers` and `--ray`."""
     parser.add_argument(
         "--workers", type=int, default=0, help="processes; 0: one per core (default: 0)"
@@ -237,7 +238,7 @@ def add_crew(parser: CommandParser) -> None:
 
 
 def split(text: str) -> tuple[str, ...]:
-    """Read comma-separated names."""
+    """Split comma-separated names."""
     names = find_text(text.strip("[] ")).split(",")
     return tuple(name.strip() for name in names if name.strip())
 
@@ -246,9 +247,9 @@ def read_config[C: CollectConfig](kind: type[C], arguments: argparse.Namespace, 
     """Make a configuration from the flags named as its fields.
 
     Args:
-        kind: Its class.
+        kind: Configuration class.
         arguments: The flags.
-        more: Fields that have no flag of their name.
+        more: Fields without a flag of the same name.
     """
     names = {each.name for each in fields(kind)} & vars(arguments).keys()
     values = {name: getattr(arguments, name) for name in names}

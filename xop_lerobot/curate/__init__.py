@@ -1,4 +1,5 @@
-"""Curation of recorded datasets: `xop-curate` and what its verbs share.
+"""Curation of recorded datasets: the verbs of `xop-curate`, and what they share.
 
-`source` streams a dataset, `destination` puts a new one in place, `verbs` lists the verbs.
+`source` streams a dataset, `transfer` writes a new one, `destination` puts it in place, and `cli`
+lists the verbs.
 """

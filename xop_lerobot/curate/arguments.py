@@ -1,4 +1,4 @@
-"""Flags that several verbs share, so that they read and mean the same everywhere."""
+"""Flags that several verbs share, with the same meaning everywhere."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xop_lerobot.curate.destination import Destination
 
 
 def add_source(parser: CommandParser) -> None:
-    """Add `--root`, the dataset that is read."""
+    """Add `--root`, the dataset to read."""
     parser.add_argument(
         "--root", type=Path, required=True, metavar="DIR", help="directory of the dataset"
     )
@@ -24,7 +24,7 @@ def add_source(parser: CommandParser) -> None:
 
 
 def add_sources(parser: CommandParser) -> None:
-    """Add `--root` for several datasets, as `arguments.root`, a list of lists: see `get_roots`."""
+    """Add `--root` for several datasets; `get_roots` returns them."""
     parser.add_argument(
         "--root",
         type=Path,
@@ -38,13 +38,13 @@ def add_sources(parser: CommandParser) -> None:
 
 
 def get_roots(arguments: argparse.Namespace) -> list[Path]:
-    """Return the directories of `add_sources` in their order."""
+    """Return the directories of `add_sources` in the order given."""
     return [root for roots in arguments.root for root in roots]
 
 
 def add_quiet(parser: CommandParser) -> None:
     """Add `--quiet`."""
-    parser.add_argument("--quiet", action="store_true", help="show no progress")
+    parser.add_argument("--quiet", action="store_true", help="hide the progress bar")
 
 
 def add_destination(parser: CommandParser, *, in_place: bool = True) -> None:
@@ -53,26 +53,26 @@ def add_destination(parser: CommandParser, *, in_place: bool = True) -> None:
         "--out",
         type=Path,
         metavar="DIR",
-        help="directory of the new dataset, which must not exist; the source stays as it is",
+        help="directory of the new dataset, which must not exist; the source is not changed",
     )
     if in_place:
         parser.add_argument(
             "--in-place",
             action="store_true",
-            help="put the new dataset in the place of the source, which is deleted",
+            help="replace the source by the new dataset; the source is deleted",
         )
     parser.add_argument(
-        "--dry-run", action="store_true", help="say what would be done, and do nothing"
+        "--dry-run", action="store_true", help="report what would be done, without writing"
     )
 
 
 def make_destination(
     arguments: argparse.Namespace, source: Path, *others: Path
 ) -> Destination | None:
-    """Make the place that `add_destination`'s flags ask for; None for a dry run.
+    """Make the destination that the flags of `add_destination` ask for; None for a dry run.
 
-    Call it before any work is done: it refuses what could not be written in the end. A dry run
-    refuses the same, if a place is given.
+    Call it before any work is done: it raises where the result could not be written. A dry run
+    checks the same, if a place is given.
 
     Raises:
         BadValue: Unless exactly one of `--out` and `--in-place` is given.
@@ -86,7 +86,7 @@ def make_destination(
         if arguments.dry_run:
             return None
         choices = "--out=DIR, --in-place" if hasattr(arguments, "in_place") else "--out=DIR"
-        raise BadValue(f"say where the new dataset goes: {choices}, or --dry-run")
+        raise BadValue(f"missing output: pass {choices}, or --dry-run")
     destination = Destination(out, source, *others)
     return None if arguments.dry_run else destination
 
@@ -95,13 +95,13 @@ _SPAN = re.compile(r"(\d+)(?:(-|:)(\d+))?")
 
 
 def parse_episodes(text: str) -> list[int]:
-    """Read a choice of episodes: `0,3,8-11` with 11, or `0,3,8:12` without 12, as in Python.
+    """Parse a list of episodes: `0,3,8-11` includes 11, `0,3,8:12` excludes 12, as in Python.
 
     Returns:
-        Their indices, in ascending order and without repetition.
+        Indices in ascending order, without duplicates.
 
     Raises:
-        BadValue: If it is none.
+        BadValue: If it is malformed or a range is empty.
     """
     chosen: set[int] = set()
     for part in text.split(","):
@@ -111,7 +111,7 @@ def parse_episodes(text: str) -> list[int]:
         first, sign, last = span.groups()
         named = range(int(first), int(last or first) + (sign != ":"))
         if not named:
-            raise BadValue(f"--episodes has '{part.strip()}', which names none, in '{text}'")
+            raise BadValue(f"--episodes has '{part.strip()}', an empty range, in '{text}'")
         chosen.update(named)
     return sorted(chosen)
 
@@ -119,6 +119,6 @@ def parse_episodes(text: str) -> list[int]:
 def show_progress[T](
     things: Iterable[T], total: int | None, unit: str, *, quiet: bool = False
 ) -> Iterator[T]:
-    """Yield `things` under a progress bar on standard error, if that is a terminal."""
-    disable = True if quiet else None  # None: none where standard error is no terminal
+    """Yield `things` with a progress bar on stderr, if that is a terminal."""
+    disable = True if quiet else None  # None: hide the bar if stderr is not a terminal
     yield from tqdm(things, total=total, unit=unit, disable=disable, file=sys.stderr, leave=False)

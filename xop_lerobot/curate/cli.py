@@ -1,9 +1,9 @@
-"""`xop-curate`: look at recorded datasets, throw out what is bad, mend, cut and multiply them.
+"""`xop-curate`: inspect, filter, trim, merge, split, repair, label and retarget recorded datasets.
 
     xop-curate VERB --root DIR [--out DIR] ...
 
-No verb changes the dataset that it reads, unless `--in-place` asks for it. A new dataset is built
-beside its place and gets there as a whole in the end, so a crash leaves everything as it was.
+No verb changes the dataset that it reads, unless `--in-place` is given. The new dataset is written
+to a temporary folder and moved into place when complete, so a crash leaves everything unchanged.
 """
 
 from __future__ import annotations
@@ -31,33 +31,32 @@ VERBS = {
     "retarget": "retarget",
     "report": "report",
 }
-"""Module of each verb, in the order of the list."""
+"""Module of each verb, in the order of the help."""
 
 
 class Verb(Protocol):
-    """What a verb's module has; its docstring heads its own `--help`.
+    """Interface of a verb's module; its docstring heads its own `--help`.
 
-    Modules are imported for `--help`, so whatever takes long to import (LeRobot, MuJoCo) is
-    imported in `run`.
+    Modules are imported for `--help`, so slow imports (LeRobot, MuJoCo) belong into `run`.
     """
 
     SUMMARY: str
-    """One line of the list of verbs."""
+    """One line in the list of verbs."""
 
     def add_arguments(self, parser: CommandParser) -> None:
         """Add the verb's flags."""
         ...
 
     def run(self, arguments: argparse.Namespace) -> int:
-        """Do what the flags ask for; returns the exit code."""
+        """Perform the verb; returns the exit code."""
         ...
 
 
 def load_verb(name: str) -> Verb:
-    """Import a verb.
+    """Import a verb's module.
 
     Raises:
-        UnknownName: Listing the known ones.
+        UnknownName: Listing the known verbs.
     """
     if name not in VERBS:
         raise UnknownName("verb of xop-curate", name, VERBS)
@@ -65,11 +64,11 @@ def load_verb(name: str) -> Verb:
 
 
 WRONG_USAGE = 2
-"""Exit code of a command line that is not understood."""
+"""Exit code of an invalid command line."""
 
 
 def make_parser() -> CommandParser:
-    """Make the parser of the command without a verb; it knows `--help` alone."""
+    """Make the parser of the command without a verb, which accepts `--help` alone."""
     width = max(map(len, VERBS), default=0)
     lines = [f"  {name:{width}}  {load_verb(name).SUMMARY}" for name in VERBS]
     parser = CommandParser(
@@ -107,9 +106,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with stop_on_sigterm():
             return verb.run(parsed)
     except KeyboardInterrupt:
-        print("stopped; nothing was changed", file=sys.stderr)
+        print("interrupted; nothing was changed", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # the reader of the table has seen enough
+    except BrokenPipeError:  # such as `xop-curate inspect … | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (XopError, OSError) as error:

@@ -1,4 +1,4 @@
-"""An episode, or a part of one, on its way into a new dataset, and what changes about it."""
+"""A clip: an episode or a part of one on its way into a new dataset, with its changes."""
 
 from __future__ import annotations
 
@@ -16,21 +16,20 @@ if TYPE_CHECKING:
     from xop_lerobot.curate.source import EpisodeEntry, Source
 
 PROVENANCE = "provenance"
-"""Fact that lists, step by step, where an episode comes from."""
+"""Metadata key of the list of steps that made an episode."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """What is written of one episode.
+    """An episode to write, with its changes.
 
     Attributes:
-        source: Dataset that it is in.
+        source: Dataset that contains it.
         entry: The episode.
         rows: First row, and the row after the last; None for all.
-        facts: Facts that are new or different.
-        columns: Columns that are new or different, with a row for each of `rows`.
-            Shapes (n, size).
-        task: Its task in words, where that is to be another one.
+        facts: New or changed episode metadata.
+        columns: New or changed columns, with one row for each of `rows`. Shapes (n, size).
+        task: New task description, None to keep the present one.
     """
 
     source: Source
@@ -41,12 +40,12 @@ class Clip:
     task: str | None = None
 
     def __post_init__(self) -> None:
-        """Check that there are such rows.
+        """Validate rows and columns.
 
         Raises:
-            BadDataset: If the episode has no rows at all.
-            BadValue: If it has not these.
-            BadShape: If a column has not a row for each of them.
+            BadDataset: If the episode has no rows.
+            BadValue: If it lacks some of these rows.
+            BadShape: If a column does not have one row for each of them.
         """
         if not self.entry.has_rows:
             raise make_refusal(self)
@@ -54,7 +53,7 @@ class Clip:
         if not 0 <= start < stop <= self.entry.length:
             raise BadValue(
                 f"episode {self.entry.index} has the rows 0 to {self.entry.length}; "
-                f"there is nothing from {start} to {stop}"
+                f"got {start} to {stop}"
             )
         for key, column in self.columns.items():
             if column.ndim != 2 or len(column) != len(self):
@@ -76,21 +75,21 @@ class Clip:
 
 
 def make_refusal(clip: Clip) -> BadDataset:
-    """Make the error of an episode that cannot be handed on, as its `faults` say."""
+    """Make the error for an episode that cannot be transferred, from its `faults`."""
     return BadDataset(
-        clip.source.root, f"{clip.entry.faults[0]}. `xop-curate repair` keeps what is whole"
+        clip.source.root, f"{clip.entry.faults[0]}. `xop-curate repair` keeps what is complete"
     )
 
 
 @dataclass(frozen=True)
 class Step:
-    """What is done to a dataset; each episode of the new one remembers it.
+    """One curation step; each new episode lists it in its provenance.
 
     Attributes:
         verb: Verb of `xop-curate`.
-        arguments: Its flags that decide the content.
-        versions: Versions of the packages that did it.
-        root: Directory that the episodes are said to be from, where that is not their source's.
+        arguments: Flags that decide the content.
+        versions: Versions of the packages used.
+        root: Source directory to name in the provenance, if not the clip's.
     """
 
     verb: str
@@ -100,7 +99,7 @@ class Step:
 
     @classmethod
     def now(cls, verb: str, **arguments: Any) -> Step:
-        """Make the step that is being done; arguments that are None or False are left out."""
+        """Make the present step; arguments that are None or False are left out."""
         import json  # noqa: PLC0415
 
         from xop_lerobot.core.versions import read_versions  # noqa: PLC0415
@@ -111,7 +110,7 @@ class Step:
 
 
 def make_facts(clip: Clip, step: Step) -> dict[str, Any]:
-    """Make the facts on an episode of the new dataset, `provenance` among them."""
+    """Make the metadata of a new episode, including `provenance`."""
     facts = {**clip.entry.facts, **clip.facts}
     start, stop = clip.span
     if clip.is_cut and isinstance(facts.get("changes"), list):
@@ -132,15 +131,15 @@ def make_facts(clip: Clip, step: Step) -> dict[str, Any]:
 
 
 def name_source(root: Path) -> str:
-    """Name a dataset by its directory and the one above, as repositories are: `me/boxes`."""
+    """Name a dataset by the last two parts of its directory, like a repository: `me/boxes`."""
     parts = root.resolve().parts[-2:]
     return "/".join(part for part in parts if part != root.anchor)
 
 
 def cut_changes(changes: list[Any], start: int, stop: int) -> list[Any]:
-    """Cut the list of what changed in an episode to the rows from `start` to `stop`.
+    """Restrict the list of changes in an episode to the rows from `start` to `stop`.
 
-    What came into force before them was so from the first of them on.
+    Changes before `start` are still in force there, so they move to its first row.
     """
     kept = []
     for change in changes:

@@ -1,4 +1,4 @@
-"""Whether the columns of a parquet file are what the features say, by its footer alone."""
+"""Check the columns of a Parquet file against the dataset's features, by its footer alone."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 PICTURES = ("video", "image")
-"""Types of features whose values are no numbers in the rows."""
+"""Feature types whose values are not numbers in the rows."""
 _KINDS = {"bool": "b", "float": "f", "int": "i", "uint": "u"}
 
 
 def find_faults(file: pq.ParquetFile, features: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    """Find the columns that are missing, or have another size, other values, or empty ones.
+    """Yield the columns that are missing or have a wrong size, type or null values.
 
-    No row is read: the footer tells the type of each column, and how many values it holds.
+    No row is read: the footer states the type of each column and its number of values.
 
     Args:
         file: The file.
         features: Features of the dataset.
 
     Yields:
-        What is wrong with a column, in words that follow on the file's name.
+        What is wrong with a column, phrased to follow the file's name.
     """
     counts = _count_values(file.metadata)
     rows, schema = file.metadata.num_rows, file.schema_arrow
@@ -49,11 +49,11 @@ def find_faults(file: pq.ParquetFile, features: Mapping[str, Mapping[str, Any]])
             each = f"{values / rows:g}" if rows else "no"
             yield f"has {each} entries a row in the column '{key}', which should have {size}"
         elif empty and pa.types.is_nested(schema.field(place).type):
-            yield f"has {empty} empty entries in the column '{key}'"
+            yield f"has {empty} null entries in the column '{key}'"
 
 
 def _find_leaf(kind: pa.DataType) -> pa.DataType | None:
-    """Find what a nested list holds in the end; None for pictures."""
+    """Return the element type of a nested list; None for images."""
     while pa.types.is_nested(kind):
         if pa.types.is_struct(kind):
             return None
@@ -62,13 +62,13 @@ def _find_leaf(kind: pa.DataType) -> pa.DataType | None:
 
 
 def _count_values(metadata: pq.FileMetaData) -> dict[str, tuple[int, int]]:
-    """Count the values of each column and, where that is stated, the empty ones among them."""
+    """Count the values of each column and, where stated, its nulls."""
     counts: dict[str, tuple[int, int]] = {}
     for group in range(metadata.num_row_groups):
         row_group = metadata.row_group(group)
         for index in range(row_group.num_columns):
             column = row_group.column(index)
-            # The path of a list goes on with `.list.element`; keys may have points too.
+            # A list's path ends in `.list.element`; keys may contain dots, too.
             key = column.path_in_schema.split(".list.")[0]
             statistics = column.statistics
             empty = statistics.null_count if statistics and statistics.has_null_count else 0

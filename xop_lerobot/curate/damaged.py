@@ -1,8 +1,8 @@
-"""What is left of a recording that was cut off, laid out so that it can be read as a dataset.
+"""Reconstruct an interrupted recording as a readable dataset in another folder.
 
-A killed recorder, a full disk or a copy that broke off leaves metadata that is missing or does not
-fit, which rows and images tell too. Rows come from Parquet files with a footer: what a file without
-one holds cannot be read.
+A killed recorder, a full disk or an interrupted copy leaves metadata that is missing or
+inconsistent, which rows and images can replace. Rows come from Parquet files with a footer; a file
+without one cannot be read.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ from xop_lerobot.curate.video_search import VideoSearch
 from xop_lerobot.recording.facts import FACTS_DIR
 
 _COUNTERS = ("episode_index", "frame_index", "task_index")
-# What reading a parquet file raises that is not what it should be; names may be no text.
+# Errors of reading a malformed Parquet file; column names may not decode as text.
 _UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError)
 
 
 @dataclass
 class DamagedDataset:
-    """What is left of a dataset.
+    """Reconstruction of a damaged dataset.
 
     Attributes:
         root: Its directory.
-        source: The readable part, laid out elsewhere.
-        entries: The episodes that are whole, in order.
-        lost: Why each other episode is not, by its index.
-        notes: What else was found and done.
+        source: The readable part, reconstructed elsewhere.
+        entries: Complete episodes, in order.
+        lost: Reason for each lost episode, by index.
+        notes: Other findings and repairs.
     """
 
     root: Path
@@ -62,10 +62,10 @@ class DamagedDataset:
 
 
 def reconstruct(root: Path, folder: Path) -> DamagedDataset:
-    """Lay out in `folder` what is readable of the dataset `root`, which is not changed.
+    """Reconstruct in `folder` the readable part of the dataset `root`, which is not changed.
 
     Raises:
-        BadDataset: If `meta/info.json` is not readable, or a file of rows is not while no metadata
+        BadDataset: If `meta/info.json` is not readable, or if a file of rows is not and no metadata
             says which episodes are lost with it.
     """
     with Source(root) as source:
@@ -93,14 +93,17 @@ def reconstruct(root: Path, folder: Path) -> DamagedDataset:
     damaged.source = Source(folder)
     _find_whole(damaged, rows, known, _find_tasks(damaged, rows, known, folder))
     _note_strays(damaged, info)
-    damaged.notes[:] = dict.fromkeys(damaged.notes)  # a fault may be that of two episodes
+    damaged.notes[:] = dict.fromkeys(damaged.notes)  # two episodes may share a fault
     return damaged
 
 
 def _lay_out_rows(
     damaged: DamagedDataset, unreadable: list[str], folder: Path
 ) -> Iterator[tuple[int, tuple[Path, pa.Table]]]:
-    """Yield file and counters of each episode by its index; list the files that cannot be."""
+    """Link readable files of rows; yield file and counters of each episode by index.
+
+    Unreadable files are appended to `unreadable`.
+    """
     for path in sorted((damaged.root / "data").glob("*/*.parquet")):
         name = path.relative_to(damaged.root)
         try:
@@ -132,7 +135,7 @@ def _read_counters(root: Path, name: Path) -> pa.Table:
 def _read_known(
     damaged: DamagedDataset, info: dict[str, Any], folder: Path
 ) -> dict[int, EpisodeEntry]:
-    """Read the metadata that is readable, and lay it out for the statistics."""
+    """Read the readable metadata, and link its files for the statistics."""
     known: dict[int, EpisodeEntry] = {}
     known_files = 0
     for path in sorted((damaged.root / EPISODES_DIR).glob("*/*.parquet")):
@@ -141,13 +144,13 @@ def _read_known(
             with pq.ParquetFile(path) as file:
                 file.read(use_threads=False)
         except _UNREADABLE as error:
-            damaged.notes.append(f"{name} is not readable ({_first_line(error)}): made anew")
+            damaged.notes.append(f"{name} is not readable ({_first_line(error)}): rebuilt")
             continue
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).symlink_to(path.resolve())
         known_files += 1
     if not known_files:
-        damaged.notes.append(f"{EPISODES_DIR} has nothing readable: made anew of rows and pictures")
+        damaged.notes.append(f"{EPISODES_DIR} has nothing readable: rebuilt from rows and images")
         return known
     try:
         for entry in read_entries(folder, info, damaged.notes.append):
@@ -163,14 +166,16 @@ def _find_tasks(
     known: dict[int, EpisodeEntry],
     folder: Path,
 ) -> dict[int, str]:
-    """Read the tasks by their numbers, or find them by the episodes that have a single one."""
+    """Read the task descriptions by index, or infer them from episodes with a single task."""
     try:
         tasks = read_tasks(folder)
         if not has_index_of_words(folder):
-            damaged.notes.append(f"{TASKS_FILE} has its words where LeRobot does not look: mended")
+            damaged.notes.append(
+                f"{TASKS_FILE} has its descriptions where LeRobot does not look: repaired"
+            )
         return tasks
     except BadDataset:
-        damaged.notes.append(f"{TASKS_FILE} is not readable: made anew of what the episodes say")
+        damaged.notes.append(f"{TASKS_FILE} is not readable: rebuilt from what the episodes say")
     tasks: dict[int, str] = {}
     for index, (_, table) in rows.items():
         numbers = table["task_index"].unique().to_pylist()
@@ -207,13 +212,13 @@ def _find_whole(
         whole = _describe(damaged, index, entry, file, table, tasks)
         if not np.array_equal(frames, np.arange(expected)):
             damaged.lost[index] = f"it has {len(frames)} of {expected} rows"
-            whole = dataclasses.replace(whole, length=expected)  # so many pictures it has
+            whole = dataclasses.replace(whole, length=expected)  # so many images belong to it
         elif entry is None and known:
-            damaged.notes.append(f"episode {index} is not in {EPISODES_DIR}: made anew")
+            damaged.notes.append(f"episode {index} is not in {EPISODES_DIR}: rebuilt")
         elif entry is not None and entry.has_rows and entry.file != file:
             damaged.notes.append(
                 f"episode {index} is in {file}, and not in {entry.file}, as {EPISODES_DIR} says: "
-                "mended"
+                "repaired"
             )
         found.append(whole)
     _note_faults(damaged, known, found)
@@ -235,7 +240,7 @@ def _find_whole(
 
 
 def _count_expected(entry: EpisodeEntry) -> int:
-    """Count the rows that an episode should have by its metadata; 0 where it does not say."""
+    """Number of rows of an episode by its metadata; 0 if it is not stated."""
     start, stop = entry.place or (0, 0)
     return entry.length or max(0, stop - start)
 
@@ -248,7 +253,7 @@ def _describe(
     table: pa.Table,
     tasks: dict[int, str],
 ) -> EpisodeEntry:
-    """Describe an episode by its rows, and by its metadata as far as that is there."""
+    """Describe an episode by its rows, and by its metadata where available."""
     length = table.num_rows
     if entry is not None:
         return dataclasses.replace(entry, length=length, file=file)
@@ -264,15 +269,15 @@ def _describe(
 def _note_faults(
     damaged: DamagedDataset, known: Mapping[int, EpisodeEntry], found: Sequence[EpisodeEntry]
 ) -> None:
-    """Note what the metadata says wrongly, and what is not numbered as LeRobot takes for granted.
+    """Note wrong metadata and numbering that LeRobot would misread.
 
-    All of it is made and counted anew.
+    All of it is rewritten and renumbered.
     """
     check, held = OrderCheck(damaged.source), {entry.index: entry for entry in found}
     for index, entry in known.items():
         rows = None
         if index in held and held[index].length == entry.length and index not in damaged.lost:
-            with suppress(BadDataset):  # which is told when the rows are checked
+            with suppress(BadDataset):  # reported when the rows are checked
                 rows = damaged.source.read(held[index], check.columns)
         damaged.notes += (*entry.faults, *check.check(entry, rows))
 
@@ -286,17 +291,15 @@ def _check_rows(source: Source, entry: EpisodeEntry, schema: pa.Schema) -> str:
 
 
 def _note_strays(damaged: DamagedDataset, info: dict[str, Any]) -> None:
-    """Note what an episode that was under way has left behind."""
+    """Note the leftovers of an unfinished episode."""
     root = damaged.root
     for folder in sorted(root.glob("tmp*")):
         if folder.is_dir():
-            damaged.notes.append(
-                f"{folder.name}/ holds pictures of an unfinished episode: left out"
-            )
+            damaged.notes.append(f"{folder.name}/ holds images of an unfinished episode: left out")
     for folder in sorted(itertools.chain(root.glob("images/*/episode*"))):
         count = sum(1 for _ in folder.iterdir())
         damaged.notes.append(
-            f"{folder.relative_to(root)} holds {count} pictures of an unfinished episode: left out"
+            f"{folder.relative_to(root)} holds {count} images of an unfinished episode: left out"
         )
     spans = [span for entry in damaged.entries for span in entry.videos.values()]
     used = damaged.source.video_use.files | {span.file for span in spans}

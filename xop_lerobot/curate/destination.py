@@ -1,13 +1,13 @@
-"""Where a new dataset is built, and how it gets to its place: as a whole, or not at all.
+"""Atomic output of a dataset: it is built in a work folder and moved into place when complete.
 
-Everything lies beside the place, in a hidden directory `.<name>.curating`, until it is finished:
+The work folder is a hidden directory beside the destination, `.<name>.curating`:
 
-    lock         held by the run that is at work
+    lock         held by the running process
     dataset/     the dataset being built
-    previous/    the dataset that it replaces, for as long as its deletion takes
+    previous/    the dataset that it replaces, until that is deleted
 
-The last step is one rename. Where a dataset is changed in place, the two change names with each
-other in one step, so that at any moment one of them is there, whole.
+The last step is one rename. An in-place change exchanges both directories in one step, so one
+complete dataset exists at any moment.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from xop_lerobot.core.folders import FolderTaken, check_no_mount, finish_swap, l
 
 
 class Destination:
-    """A new dataset's place; a context in which it is built.
+    """Place of a new dataset; a context manager that yields the directory to build it in.
 
         with Destination(out, source.root) as draft:
             make_dataset(root=draft)
 
-    When the block ends, the draft is written to the disk and takes its place. When it raises,
-    nothing stays behind, and nothing that was there has changed.
+    On success the draft is flushed to disk and moved into place. On an exception it is removed and
+    nothing that existed has changed.
 
     Args:
-        out: Directory of the new dataset; None to change the source in place.
-        source: Directory of the dataset that is read.
-        others: Directories of further ones.
+        out: Directory of the new dataset; None to replace the source.
+        source: Directory of the source dataset.
+        others: Directories of further source datasets.
 
     Attributes:
-        root: Where the dataset will be.
+        root: Final directory.
         in_place: Whether it replaces the source.
-        draft: Where it is built. It does not exist when the block begins; its parent does.
+        draft: Directory to build it in. It does not exist on entry; its parent does.
 
     Raises:
-        FolderTaken: If `out` is there already, or lies in a source, or a source in it.
+        FolderTaken: If `out` exists, or it and a source lie inside each other.
     """
 
     def __init__(self, out: Path | None, source: Path, *others: Path) -> None:
@@ -61,9 +61,7 @@ class Destination:
         for folder in (source, *others):
             held = folder.resolve()
             if self.root.is_relative_to(held):
-                raise FolderTaken(
-                    f"'{out}' is inside of the dataset '{folder}'. Choose another --out"
-                )
+                raise FolderTaken(f"'{out}' is inside the dataset '{folder}'. Choose another --out")
 
     def __enter__(self) -> Path:
         try:
@@ -105,7 +103,7 @@ class Destination:
     def _put(self) -> None:
         if not self.draft.is_dir():
             raise XopError(f"nothing was written for '{self.root}'")
-        if not self.in_place and os.path.lexists(self.root):  # somebody made it meanwhile
+        if not self.in_place and os.path.lexists(self.root):  # created meanwhile
             raise FolderTaken(f"'{self.root}' exists already. Choose another --out, or delete it")
         swap_in(self.draft, self.root, self._previous)
 
@@ -115,10 +113,10 @@ class Destination:
             self._lock.close()
             self._lock = None
         for folder in () if keep_parents else reversed(self._made):
-            with suppress(OSError):  # gone already, or not empty: somebody else's by now
+            with suppress(OSError):  # already removed, or used by another process
                 folder.rmdir()
 
 
 def _find_place(out: Path) -> Path:
-    """Resolve all of a path but a link in its last part, which is a thing that is there."""
+    """Resolve a path except for its last part: a link there is an existing file."""
     return out.parent.resolve() / out.name if out.name not in ("", "..") else out.resolve()

@@ -1,4 +1,4 @@
-"""Episodes of a dataset, as its metadata lists them, one after another."""
+"""Episode entries of a dataset's metadata, read one after another."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from xop_lerobot.core.errors import BadDataset
 from xop_lerobot.recording.facts import EPISODES_FILE, FACTS_PREFIX
 
 UNREADABLE = (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError)
-"""What reading a malformed parquet file may raise."""
+"""Errors that reading a malformed Parquet file may raise."""
 EPISODES_DIR = Path("meta") / "episodes"
 _REQUIRED = ("length", "data/chunk_index", "data/file_index")
 _PLACES = ("chunk_index", "file_index")
 _TIMES = ("from_timestamp", "to_timestamp")
 _COUNTS = ("dropped_frames", "seed")
-"""Facts that are whole numbers."""
+"""Integers of the episode metadata."""
 _JSON_FACTS = ("versions", "settings", "changes", "provenance")
 _BATCH = 64
-"""Episodes whose metadata is in memory at a time."""
+"""Number of episodes whose metadata is in memory at a time."""
 
 
 @dataclass(frozen=True)
 class VideoSpan:
-    """Where the pictures of an episode lie.
+    """Location of an episode's images.
 
     Attributes:
         file: The video, relative to the dataset's directory.
-        start: Time of the first picture in it [s].
-        stop: Time of the end of the last [s].
+        start: Time of its first image [s].
+        stop: End time of its last image [s].
     """
 
     file: Path
@@ -46,20 +46,20 @@ class VideoSpan:
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """What the metadata says of an episode.
+    """Metadata of an episode.
 
     Attributes:
         index: Its `episode_index`.
-        length: Its frames.
-        tasks: Its tasks in words.
-        facts: This project's facts on it; empty where they are not known.
-        file: Its rows' parquet file, relative to the dataset's directory.
-        videos: Its pictures by feature key; none for pictures that are in the rows.
-        place: Number of its first row among all of the dataset, and of the row after its last, as
-            stated; None where they are not.
-        faults: What is wrong with what the metadata says, so that the episode cannot be handed
-            on. Without a length it is 0, without a file that is the empty path, and pictures
-            that are not to be found are not in `videos`.
+        length: Number of frames.
+        tasks: Its task descriptions.
+        facts: This project's metadata of it (`meta/xop`); empty if unknown.
+        file: Parquet file of its rows, relative to the dataset's directory.
+        videos: Its videos by feature key; none for images stored in the rows.
+        place: Its first row in the dataset and the row after its last, as stated; None if not
+            stated.
+        faults: Faults of the metadata because of which the episode cannot be transferred. An
+            unknown length is 0, an unknown file is the empty path, and unknown videos are not in
+            `videos`.
     """
 
     index: int
@@ -73,15 +73,15 @@ class EpisodeEntry:
 
     @property
     def has_rows(self) -> bool:
-        """Whether the metadata says where its rows are, and that there are any."""
+        """Whether the metadata states where its rows are, and that there are any."""
         return self.length > 0 and self.file != Path()
 
 
 class FactsFile:
-    """`meta/xop/episodes.jsonl`, read a line at a time.
+    """Random access to the lines of `meta/xop/episodes.jsonl`.
 
-    Only where each line begins is kept in memory. Lines that are no JSON objects, as a crash
-    leaves them, are passed over; of two lines on one episode the last counts.
+    Only the offset of each line is kept in memory. Lines that are not JSON objects, as a crash
+    leaves them, are skipped; of two lines for one episode the last counts.
 
     Args:
         root: Directory of the dataset.
@@ -101,7 +101,7 @@ class FactsFile:
                 place += len(line)
 
     def read(self, index: int) -> dict[str, Any]:
-        """Read the facts on episode `index`; empty if there are none."""
+        """Read the line of episode `index`; empty if there is none."""
         if index not in self._places:
             return {}
         with self._path.open("rb") as file:
@@ -125,14 +125,14 @@ def read_entries(
 ) -> Iterator[EpisodeEntry]:
     """Read the episodes in order.
 
-    What is wrong with one episode is no fault of the others: it is in its `faults`.
+    A fault of one episode is listed in its `faults` and does not affect the others.
 
     Args:
         root: Directory of the dataset.
         info: Content of `meta/info.json`.
-        note: Told of each file, and of each episode that has no number of its own, which are then
-            passed over; if None, that is an error.
-        use: What `find_video_use` has found; found anew if None.
+        note: Receives each unreadable file, and each episode without an index of its own; both are
+            then skipped. None makes them errors.
+        use: Result of `find_video_use`; computed if None.
 
     Raises:
         BadDataset: If the metadata is missing or malformed.
@@ -160,7 +160,7 @@ def read_entries(
             _fault(root, note, f"{name} is not readable ({text}). {_REPAIR}")
 
 
-_REPAIR = "`xop-curate repair` restores a recording that was cut off"
+_REPAIR = "`xop-curate repair` restores an interrupted recording"
 
 
 def _count(info: Mapping[str, Any]) -> str:
@@ -174,7 +174,7 @@ def _fault(root: Path, note: Callable[[str], None] | None, text: str) -> None:
 
 
 def _read_rows(path: Path, keys: Sequence[str] | None = None) -> Iterator[dict[str, Any]]:
-    """Read the rows of a file of metadata; without `keys` all but the statistics."""
+    """Read the rows of a metadata file; without `keys` all columns but the statistics."""
     with pq.ParquetFile(path) as file:
         names = [
             name
@@ -186,9 +186,9 @@ def _read_rows(path: Path, keys: Sequence[str] | None = None) -> Iterator[dict[s
 
 
 def to_count(value: object) -> int | None:
-    """Return a number of 0 or more, None if it is none.
+    """Return `value` as an integer of at least 0, None if it is not one.
 
-    A column of whole numbers in which one is missing has become one of floats in pandas.
+    Integral floats are accepted: pandas turns an integer column with a missing value into floats.
     """
     if isinstance(value, float) and value.is_integer():
         value = int(value)
@@ -259,7 +259,7 @@ def _read_facts(
             except ValueError:
                 del facts[name]
     line = lines.read(index)
-    # A line about an episode of another length is what another tool left behind.
+    # A line with another length is stale: another tool has changed the episode since.
     if line.pop("length", length) == length or length is None:
         facts |= line
     facts.pop("episode_index", None)
@@ -269,7 +269,7 @@ def _read_facts(
 def _find_videos(
     root: Path, info: Mapping[str, Any], index: int, row: Mapping[str, Any], faults: list[str]
 ) -> Iterator[tuple[str, VideoSpan]]:
-    """Find the pictures of an episode; what is not said rightly goes to `faults`."""
+    """Yield the videos of an episode; append missing or malformed ones to `faults`."""
     for key in _list_video_keys(info):
         prefix = f"videos/{key}/"
         if any(row.get(prefix + name) is None for name in (*_PLACES, *_TIMES)):
@@ -294,7 +294,7 @@ def _list_video_keys(info: Mapping[str, Any]) -> list[str]:
 def _find_span(
     root: Path, info: Mapping[str, Any], key: str, row: Mapping[str, Any]
 ) -> VideoSpan | None:
-    """Find the pictures of a camera; None if it is not said rightly where they are."""
+    """Find the images of a camera; None if their location is missing or malformed."""
     file = _find_video(root, info, key, row)
     start, stop = (_to_seconds(row.get(f"videos/{key}/{name}")) for name in _TIMES)
     return None if file is None or start is None or stop is None else VideoSpan(file, start, stop)
@@ -317,11 +317,11 @@ def _to_seconds(value: object) -> float | None:
 
 @dataclass(frozen=True)
 class VideoUse:
-    """Which episodes' pictures lie in which videos, of a whole dataset.
+    """Assignment of videos to episodes, over the whole dataset.
 
     Attributes:
-        files: Videos that episodes name, relative to the dataset's directory.
-        shared: Of each episode whose pictures another one has too, what to say of it.
+        files: Videos that episodes use, relative to the dataset's directory.
+        shared: Messages on images claimed by several episodes, by episode index.
     """
 
     files: frozenset[Path]
@@ -329,13 +329,13 @@ class VideoUse:
 
 
 def find_video_use(root: Path, info: Mapping[str, Any]) -> VideoUse:
-    """Find the videos that episodes name, and the pictures that two of them claim.
+    """Find the videos that episodes use, and images claimed by two episodes.
 
-    A picture belongs to one episode. Where two have it, one of them is wrong, and the metadata
-    does not tell which.
+    An image belongs to one episode. Where two claim it, one of them is wrong, and the metadata does
+    not tell which.
 
     Raises:
-        BadDataset: If the pattern of the paths is malformed.
+        BadDataset: If the path pattern is malformed.
     """
     keys = _list_video_keys(info)
     if not keys:
@@ -354,10 +354,10 @@ def find_video_use(root: Path, info: Mapping[str, Any]) -> VideoUse:
                         files.add(file)
                     if span is not None and index is not None:
                         spans.setdefault(span.file, []).append((span.start, span.stop, index, key))
-        except UNREADABLE:  # which is told where the episodes are read
+        except UNREADABLE:  # reported where the episodes are read
             continue
     shared: dict[int, tuple[str, ...]] = {}
-    half = 0.5 / info["fps"]  # for rounding
+    half = 0.5 / info["fps"]  # tolerance for rounded times
     for file, claims in spans.items():
         claims.sort()
         last = claims[0]
@@ -365,7 +365,7 @@ def find_video_use(root: Path, info: Mapping[str, Any]) -> VideoUse:
             start, stop, index, key = claim
             if start < last[1] - half and index != last[2]:
                 text = (
-                    f"the episodes {last[2]} and {index} have the same pictures of '{key}', "
+                    f"the episodes {last[2]} and {index} have the same images of '{key}', "
                     f"{file} from {start:.2f} s to {min(stop, last[1]):.2f} s"
                 )
                 for each in (last[2], index):
@@ -381,5 +381,5 @@ def _find_file(root: Path, template: object, **places: Any) -> Path:
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         raise BadDataset(root, f"meta/info.json has a malformed path '{template}'") from error
     if path.is_absolute() or ".." in path.parts:
-        raise BadDataset(root, f"meta/info.json has a path that leads out of it, '{template}'")
+        raise BadDataset(root, f"meta/info.json has a path outside the dataset, '{template}'")
     return path

@@ -1,12 +1,11 @@
-"""Conditions on an episode's figures: `success and tracking_p95 < 0.1 and not fall`.
+"""Conditions on an episode's metrics: `success and tracking_p95 < 0.1 and not fall`.
 
-They are written like Python, checked as a whole (names and kinds) before any episode is read, and
-evaluated from left to right. Nothing but what is listed here can be written: `and or not`,
-`< <= > >= == !=`, `in`, `is None`, `+ - * / %`, `abs min max`, numbers, texts, lists of them,
-`True False`.
+The syntax is a subset of Python's: `and or not`, `< <= > >= == !=`, `in`, `is None`, `+ - * / %`,
+`abs min max`, numbers, texts, lists of them, `True False`. Names and types are checked before any
+episode is read; evaluation is from left to right.
 
-A figure may be missing (None): the dataset has not the columns for it. A condition that comes to
-a missing figure has no result, and its episode is excluded; `x is None` asks whether it is missing.
+A metric may be missing (None) where the dataset lacks its columns. A condition that reaches a
+missing metric has no result, and its episode is excluded; `x is None` tests for it.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from typing import Any, NoReturn
 from xop_lerobot.core.errors import BadValue, UnknownName
 
 MAX_LENGTH = 2000
-"""Characters that an expression may have."""
+"""Largest length of an expression [characters]."""
 
 
 class Kind(Enum):
-    """What a figure is, as it reads in an error."""
+    """Type of a metric; the value is how errors call it."""
 
     FLAG = "yes or no"
     NUMBER = "a number"
@@ -34,10 +33,10 @@ class Kind(Enum):
 
 
 class UnknownFigure(UnknownName):
-    """An expression has a name that is no figure; the message lists those that are."""
+    """An expression contains an unknown name; the message lists the known ones."""
 
     def __init__(self, name: str, known: Mapping[str, Kind]) -> None:
-        super().__init__("figure", name, known)
+        super().__init__("metric", name, known)
         near = difflib.get_close_matches(name, [*known, "True", "False", "None"], 1)
         if near:
             head, tail = self.args[0].split(". Known", 1)
@@ -45,11 +44,11 @@ class UnknownFigure(UnknownName):
 
 
 class _Missing(Exception):
-    """A figure that is needed has no value."""
+    """Raised when the expression reaches a missing metric."""
 
 
 class _Figures(dict[str, Any]):
-    """Values by name as Python looks them up: `x` must not be missing, `x?` may be."""
+    """Values by name as Python looks them up: `x` raises if missing, `x?` returns None."""
 
     def __getitem__(self, name: str) -> Any:
         if name.endswith(_MAY_BE_MISSING):
@@ -68,19 +67,19 @@ _GLOBALS = {"__builtins__": _FUNCTIONS}
 
 
 class Expression:
-    """A condition on an episode.
+    """Condition on an episode.
 
     Args:
-        text: The expression.
-        kinds: Every name that may be in it, and what it is.
+        text: The expression, stripped.
+        kinds: Type of each name that may occur.
 
     Attributes:
         text: The same.
-        names: The names that are in it.
+        names: The names that occur.
 
     Raises:
-        UnknownFigure: If it has another name.
-        BadValue: If it is malformed, or is not yes or no; the message quotes the fault.
+        UnknownFigure: If it contains another name.
+        BadValue: If it is malformed or not boolean; the message quotes the fault.
     """
 
     def __init__(self, text: str, kinds: Mapping[str, Kind]) -> None:
@@ -90,7 +89,7 @@ class Expression:
         if len(self.text) > MAX_LENGTH:
             raise BadValue(f"an expression has at most {MAX_LENGTH} characters, got {len(text)}")
         try:
-            with warnings.catch_warnings(action="ignore"):  # Python's own on what is odd
+            with warnings.catch_warnings(action="ignore"):  # Python's warnings about odd code
                 tree = ast.parse(self.text, mode="eval")
                 kind = self._check(tree.body)
                 if kind is not Kind.FLAG:
@@ -102,21 +101,23 @@ class Expression:
             raise BadValue(f"expression '{self.text[:40]}…' is too deep, or malformed") from error
 
     def evaluate(self, values: Mapping[str, Any]) -> bool | None:
-        """Evaluate the expression on one episode, as Python does: from left to right.
+        """Evaluate the expression on one episode, from left to right as Python does.
 
         Args:
-            values: Value of each name in `names`; None for what is missing.
+            values: Value of each name in `names`; None if missing.
 
         Returns:
-            Whether it holds; None if it comes to a missing figure, or divides by zero.
+            Whether it holds; None if it reaches a missing metric, or divides by zero.
         """
         try:
-            return eval(self._code, _GLOBALS, _Figures(values))  # nothing but what `_check` lets in
+            return eval(
+                self._code, _GLOBALS, _Figures(values)
+            )  # safe: `_check` has admitted a fixed set of nodes
         except (_Missing, ArithmeticError):
             return None
 
     def _check(self, node: ast.expr) -> Kind:
-        """Check that a part is one of those that may be written; return what it is."""
+        """Check that a node is one of the permitted kinds; return its type."""
         match node:
             case ast.Constant(value=bool() | int() | float() | str() as value):
                 return _KINDS[type(value)]
@@ -161,7 +162,7 @@ class Expression:
             case [ast.Is() | ast.IsNot()]:
                 is_none = isinstance(right, ast.Constant) and right.value is None
                 if not is_none or not isinstance(node.left, ast.Name):
-                    self._refuse(node, "has `is`, which asks a figure for None alone")
+                    self._refuse(node, "has `is`, which asks a metric for None alone")
                 node.left.id += _MAY_BE_MISSING
             case [ast.In() | ast.NotIn()] if isinstance(right, ast.Tuple | ast.List | ast.Set):
                 self._expect(kind, right.elts)
@@ -175,7 +176,7 @@ class Expression:
         return Kind.FLAG
 
     def _check_link(self, node: ast.Compare, kind: Kind, sign: ast.cmpop, right: ast.expr) -> None:
-        """Check what is on the right of a sign, where `kind` is on the left."""
+        """Check the right side of a comparison, given the type of the left side."""
         if isinstance(right, ast.Constant) and right.value is None:
             self._refuse(node, "compares with None. Write `is None` or `is not None`")
         other = self._check(right)
@@ -186,7 +187,7 @@ class Expression:
                 f"'{self._quote(right)}' is {other.value}",
             )
         if not isinstance(sign, ast.Eq | ast.NotEq) and kind is not Kind.NUMBER:
-            self._refuse(node, "orders what is no number. Known: ==, !=")
+            self._refuse(node, "orders values that are not numbers. Known: ==, !=")
         if isinstance(sign, ast.Is | ast.IsNot | ast.In | ast.NotIn):
             self._refuse(node, "has `in` or `is` in a chain. Write each comparison alone")
 

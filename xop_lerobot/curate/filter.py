@@ -1,13 +1,13 @@
-r"""Keep the episodes for which an expression holds, in a new dataset.
+r"""Write the episodes for which an expression holds to a new dataset.
 
     xop-curate filter --root outputs/week --out outputs/good \
         --where "success and tracking_p95 < 0.1 and not fall"
     xop-curate filter --root outputs/week --where "duration > 5 and idle_time < 2" --dry-run
 
 In the expression: and or not, < <= > >= == !=, in, is None, + - * / %, abs min max, numbers,
-'texts', (lists), True False. A figure may be missing, where the dataset has no columns for it.
-Episodes for which the expression, read from left to right, comes to a missing figure are left out
-and counted, unless --keep-unknown; `x is None` asks whether x is missing.
+'texts', (lists), True False. A metric is missing where the dataset lacks its columns. Episodes for
+which the expression, evaluated from left to right, reaches a missing metric are left out and
+counted, unless --keep-unknown is given; `x is None` tests whether x is missing.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from xop_lerobot.curate.clip import Clip
     from xop_lerobot.curate.survey import Finding
 
-SUMMARY = "keep the episodes for which an expression over these figures holds"
+SUMMARY = "keep the episodes for which an expression over their metrics holds"
 
 _LISTED = 20
-"""Episodes that are named in the outcome."""
+"""Number of episodes listed in the report."""
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -48,15 +48,15 @@ def add_arguments(parser: CommandParser) -> None:
         "--where",
         required=True,
         metavar="EXPRESSION",
-        help="which episodes are kept, such as 'success and tracking_p95 < 0.1 and not fall'",
+        help="condition for keeping an episode, 'success and tracking_p95 < 0.1 and not fall'",
     )
     parser.add_argument(
         "--keep-unknown",
         action="store_true",
-        help="keep the episodes too for which that is not known",
+        help="also keep episodes for which it reaches a missing metric",
     )
     add_destination(parser)
-    parser.epilog = f"figures:\n{describe_figures()}"
+    parser.epilog = f"metrics:\n{describe_figures()}"
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
                 with destination as draft:
                     transfer(_make_clips(choice, entries), draft, step)
             except BadDataset as error:
-                if choice.failed:  # on the metadata, which no expression mends
+                if choice.failed:  # the metadata is damaged, so no expression avoids it
                     raise
                 hint = f'--where "({expression.text}) and readable" leaves such episodes out'
                 raise BadDataset(error.root, f"{error.fault}. {hint}") from error
@@ -100,12 +100,13 @@ class Filter:
 
     Args:
         source: The dataset.
-        expression: Which episodes are kept.
-        keep_unknown: Whether those are kept too for which that is not known.
+        expression: Condition for keeping an episode.
+        keep_unknown: Whether to keep episodes for which it has no result.
 
     Attributes:
         source: The dataset.
-        failed: Whether it was the choice that met with an error, and not who took the episodes.
+        failed: Whether an error came from reading the source here, and not from the consumer of the
+            episodes.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class Filter:
         self._missing: dict[str, int] = {}
 
     def choose(self, *, quiet: bool = True) -> Iterator[EpisodeEntry]:
-        """Choose the episodes that are kept, one at a time."""
+        """Yield the episodes to keep."""
         from xop_lerobot.curate.survey import survey  # noqa: PLC0415 SciPy, MuJoCo
 
         findings = self._guard(survey(self.source, self._expression.names))
@@ -175,7 +176,7 @@ class Filter:
         return missing or "a division by 0"
 
     def report(self) -> None:
-        """Print what was kept."""
+        """Print how many episodes were kept and which were left out."""
         total = self._kept + self._dropped
         print(
             f"{self._kept} of {total} episodes kept, {self._kept_seconds:.1f} s of "

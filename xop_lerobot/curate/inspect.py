@@ -1,11 +1,11 @@
-"""Show what is in a dataset, episode by episode, and change nothing.
+"""Show the contents of a dataset, episode by episode, without changing it.
 
     xop-curate inspect --root outputs/walk
     xop-curate inspect --root outputs/walk --json walk.json --quiet
     xop-curate inspect --root outputs/walk --show episode,success,tracking_head_p95,task
 
-What a dataset has no columns for is not known: `-` in the table, null in JSON. Files that cannot be
-read are named; the exit code is 1 then, and everything else is shown all the same.
+A metric whose columns are missing is `-` in the table and null in JSON. Unreadable files are named
+and set the exit code to 1; everything else is still shown.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from xop_lerobot.curate.expression import Kind, UnknownFigure
 from xop_lerobot.curate.measures import FIGURES, KINDS, describe_figures
 from xop_lerobot.curate.source import Source
 
-SUMMARY = "show what is in a dataset: tracking, smoothness, falls, gaps, idle time, …"
+SUMMARY = "show the contents of a dataset: tracking, smoothness, falls, gaps, idle time, …"
 
 SHOWN = (
     "episode", "duration", "success", "fall", "collision", "tracking_mean", "tracking_p95",
     "tracking_angle_mean", "tracking_angle_p95", "command_roughness", "gap_time", "late",
     "dropped_frames", "plan_age_p95", "idle_time", "robot", "task",
 )  # fmt: skip
-"""Columns of the table, unless others are asked for."""
+"""Default columns of the table."""
 SUMMARISED = (
     "duration", "tracking_mean", "tracking_p95", "tracking_angle_mean", "command_roughness",
     "command_ldlj", "hand_jerk", "plan_age_p95",
 )  # fmt: skip
-"""Numbers whose mean and range are told in the end."""
+"""Metrics whose mean and range are printed in the summary."""
 _STANDARD_OUTPUT = "-"
 
 
@@ -55,16 +55,16 @@ def add_arguments(parser: CommandParser) -> None:
     parser.add_argument(
         "--json",
         metavar="FILE",
-        help="write all figures as a list of objects, one an episode; - for standard output, "
-        "without a table then (default: none)",
+        help="write all metrics as a JSON list, one object per episode; - for standard output "
+        "instead of the table (default: none)",
     )
     parser.add_argument(
         "--show",
         default=",".join(SHOWN),
         metavar="A,B,…",
-        help=f"figures that are the columns of the table (default: {', '.join(SHOWN)})",
+        help=f"metrics in the table (default: {', '.join(SHOWN)})",
     )
-    parser.epilog = f"figures:\n{describe_figures()}"
+    parser.epilog = f"metrics:\n{describe_figures()}"
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(table.head)
         findings = survey(source, note=faults.append)
         total = source.total_episodes
-        # On a terminal the table itself shows how far it is.
+        # On a terminal the growing table shows the progress.
         quiet = arguments.quiet or (sys.stdout.isatty() and not to_output)
         for finding in show_progress(findings, total, "episode", quiet=quiet):
             write(finding.to_json())
@@ -105,24 +105,24 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def parse_names(text: str) -> tuple[str, ...]:
-    """Read names of figures with commas between.
+    """Parse comma-separated names of metrics.
 
     Raises:
         UnknownFigure: If one is unknown, listing the known ones.
-        BadValue: If there is none.
+        BadValue: If there are none.
     """
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     for name in names:
         if name not in FIGURES:
             raise UnknownFigure(name, KINDS)
     if not names:
-        raise BadValue(f"--show must name figures, got '{text}'. Known: {', '.join(FIGURES)}")
+        raise BadValue(f"--show must name metrics, got '{text}'. Known: {', '.join(FIGURES)}")
     return names
 
 
 @contextmanager
 def _open_list(file: str | None) -> Iterator[Any]:
-    """Open a JSON list that is written an object at a time; a file is there whole or not at all."""
+    """Yield a function that appends an object to a JSON list; a file is written atomically."""
     if file is None:
         yield lambda row: None
         return
@@ -149,7 +149,7 @@ def _open_list(file: str | None) -> Iterator[Any]:
 
 
 class _ListWriter:
-    """Writes a JSON list to a stream, an object a line."""
+    """Writes a JSON list to a stream, one object per line."""
 
     def __init__(self, stream: IO[str], *, as_ascii: bool = False) -> None:
         self._stream, self._separator = stream, "[\n"
@@ -181,16 +181,16 @@ _HEADS = {
     "plan_age_p95": "age p95",
     "idle_time": "idle",
 }
-"""Heads that are shorter than the figure's name."""
+"""Column heads that are shorter than the metric's name."""
 _WIDTHS = {"robot": 8, "task": 40, "scene": 10, "low_level": 10, "clock": 8, "preset": 12}
 _MINIMUM = 5
 
 
 class Table:
-    """A table of episodes; its widths are known before the first row is.
+    """Table of episodes; widths are fixed before the first row, so rows can be streamed.
 
     Args:
-        names: Names of the figures that are its columns.
+        names: Metrics in the columns.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -214,7 +214,7 @@ class Table:
 
 
 def format_value(name: str, value: Any) -> str:
-    """Format a figure for people: a few digits, - for what is not known."""
+    """Format a metric for display: few digits, `-` for a missing value."""
     if value is None:
         return UNKNOWN
     if isinstance(value, bool):
@@ -228,10 +228,10 @@ def format_value(name: str, value: Any) -> str:
 
 
 class Totals:
-    """Sums over the episodes, of constant size.
+    """Running totals over the episodes, of constant memory.
 
     Args:
-        names: Names of the numbers whose mean and range are wanted.
+        names: Metrics whose mean and range are collected.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -265,7 +265,7 @@ class Totals:
         _count(self._tasks, figures["task"])
 
     def format(self) -> str:
-        """Format the totals, several lines."""
+        """Format the totals as several lines."""
         hours = self._seconds / 3600
         time = f"{hours:.2f} h" if hours >= 1 else f"{self._seconds:.1f} s"
         size = f"{say_count(self.episodes, 'episode')}, {say_count(self.frames, 'frame')}"
@@ -296,16 +296,16 @@ _COUNTED = {
     "collision": "a collision",
     "trouble": "trouble",
     "gaps": "gaps in tracking",
-    "late": "lateness",
-    "dropped_frames": "dropped pictures",
+    "late": "a late clock",
+    "dropped_frames": "dropped images",
     "missing_frames": "missing frames",
 }
-"""Figures of which it is counted in how many episodes they are true, or over zero."""
+"""Metrics counted by the number of episodes in which they are true or above 0."""
 _LISTED = 8
 
 
 def _count(counts: dict[str, int], value: str | None) -> None:
-    """Count a value; those after a hundred different ones are counted together."""
+    """Count a value; after a hundred distinct values the rest share one count."""
     name = UNKNOWN if value is None else value
     if name not in counts and len(counts) >= 100:
         name = "…"

@@ -7,14 +7,14 @@ r"""Label episodes with success and sub-tasks, by rule, by hand or from a file.
     xop-curate label --root outputs/week --out outputs/labelled \
         --by-hand labels.json --names reach,lift
 
---success is an expression over the figures of an episode, as in `filter`; where it comes to a
-missing one, the label stays. --subtask is one over what a frame has: each entry of each column by
-its name with `_` for dots (robot_head_z, action_mode_pos), time, left and frame; the first that
-holds counts. By hand, each episode is a strip of images in a file, and keys in the terminal answer;
-every answer is kept in the file of labels at once, and the next run goes on from there.
+--success is an expression over the metrics of an episode, as in `filter`; where it reaches a
+missing one, the label is unchanged. --subtask is an expression over the entries of a frame's
+columns, by name with `_` for dots (robot_head_z, action_mode_pos), and over time, left and frame;
+the first that holds counts. --by-hand writes a strip of images per episode and reads keys in the
+terminal; every answer is saved at once, and the next run resumes there.
 
-Success goes to the facts and to `next.success`. Sub-tasks go to the column `subtask_index`, which
-`meta/subtasks.parquet` names, and to the facts.
+Success is written to `next.success`, sub-tasks to `subtask_index` with their names in
+`meta/subtasks.parquet`; both also to the episode metadata in `meta/xop`.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ _FORM = "NAME=EXPRESSION, such as 'reach=robot_left_wrist_x > 0.3'"
 
 
 class Entry(NamedTuple):
-    """An entry of a column.
+    """Named entry of a column.
 
     Attributes:
         column: Key of the column.
-        place: Which of its entries.
-        kind: What it is.
+        place: Position of the entry in the column.
+        kind: Its type.
     """
 
     column: str
@@ -73,18 +73,18 @@ class Entry(NamedTuple):
 
 
 class FrameRules:
-    """Names the sub-task of each frame.
+    """Assigns each frame its sub-task by rules.
 
     Args:
         source: The dataset.
         texts: Rules, `NAME=EXPRESSION`; the first that holds in a frame counts.
 
     Attributes:
-        names: Names of the sub-tasks, in the order of their numbers; `other` is the last.
+        names: Names of the sub-tasks by index; `other` is the last unless a rule names it.
 
     Raises:
         BadValue: If a rule is malformed.
-        UnknownName: If one has a name that is no entry of a column.
+        UnknownName: If a rule contains a name that is no entry of a column.
     """
 
     def __init__(self, source: Source, texts: Sequence[str]) -> None:
@@ -104,7 +104,7 @@ class FrameRules:
             self.names.append(OTHER)
 
     def find(self, entry: EpisodeEntry) -> np.ndarray:
-        """Find the number of each frame's sub-task. Shape (n,).
+        """Find the index of each frame's sub-task. Shape (n,).
 
         Raises:
             BadDataset: If the episode cannot be read.
@@ -128,7 +128,7 @@ class FrameRules:
 
 
 def list_entries(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Entry]:
-    """List the entries of a dataset's columns of numbers and flags by their names in rules."""
+    """List the entries of numeric and boolean columns by their names in rules."""
     entries: dict[str, Entry] = {}
     for column, feature in features.items():
         kind = Kind.FLAG if feature["dtype"] == "bool" else Kind.NUMBER
@@ -159,21 +159,21 @@ def add_arguments(parser: CommandParser) -> None:
     add_source(parser)
     add_destination(parser)
     parser.add_argument(
-        "--success", metavar="EXPRESSION", help="which episodes succeeded, by their figures"
+        "--success", metavar="EXPRESSION", help="condition for success, over the metrics"
     )
     parser.add_argument(
         "--subtask",
         action="append",
         default=[],
         metavar="NAME=EXPRESSION",
-        help="in which frames a sub-task is done; may be given several times",
+        help="condition for the frames of a sub-task; may be given several times",
     )
     parser.add_argument("--labels", type=Path, metavar="FILE", help="JSON file of labels")
     parser.add_argument(
-        "--by-hand", type=Path, metavar="FILE", help="ask for labels, and keep them in this file"
+        "--by-hand", type=Path, metavar="FILE", help="ask for labels and save them in this file"
     )
     parser.add_argument(
-        "--names", default="", metavar="A,B", help="by hand: sub-tasks, numbered from 1"
+        "--names", default="", metavar="A,B", help="with --by-hand: sub-tasks, numbered from 1"
     )
 
 
@@ -181,7 +181,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Label a dataset; returns the exit code."""
     ways = [arguments.success or arguments.subtask, arguments.labels, arguments.by_hand]
     if sum(map(bool, ways)) != 1:
-        raise BadValue("give rules (--success, --subtask), --labels or --by-hand, and one of them")
+        raise BadValue("pass exactly one of: rules (--success, --subtask), --labels, --by-hand")
     with Source(arguments.root) as source:
         destination = make_destination(arguments, source.root)
         labeller = _make_labeller(arguments, source)
@@ -212,7 +212,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _make_labeller(arguments: argparse.Namespace, source: Source) -> Labeller:
     if arguments.labels is not None:
         if not arguments.labels.is_file():
-            raise BadValue(f"there are no labels '{arguments.labels}'")
+            raise BadValue(f"--labels: no such file '{arguments.labels}'")
         return Labeller(source, labels=read_labels(arguments.labels))
     if arguments.by_hand is not None:
         from xop_lerobot.curate.label_by_hand import ask  # noqa: PLC0415 video
@@ -226,20 +226,20 @@ def _make_labeller(arguments: argparse.Namespace, source: Source) -> Labeller:
 
 
 class Labeller:
-    """Labels the episodes of a dataset.
+    """Adds success and sub-task labels to a dataset's episodes.
 
     Args:
         source: The dataset.
-        success: Which episodes succeeded, by rule.
-        rules: Sub-tasks, by rule.
+        success: Rule for success.
+        rules: Rules for sub-tasks.
         labels: Labels by episode.
 
     Attributes:
-        names: Names of the sub-tasks; empty where none are labelled.
-        features: Features of the columns that are new.
+        names: Names of the sub-tasks; empty if none are labelled.
+        features: Features of the new columns.
 
     Raises:
-        BadValue: If there are labels of episodes that are not there.
+        BadValue: If there are labels of missing episodes.
     """
 
     def __init__(
@@ -276,7 +276,7 @@ class Labeller:
         self._frames: dict[str, int] = dict.fromkeys(self.names, 0)
 
     def make_clips(self, *, quiet: bool = True) -> Generator[Clip]:
-        """Make every episode with its labels."""
+        """Yield every episode with its labels."""
         from xop_lerobot.curate.clip import Clip  # noqa: PLC0415
 
         source = self._source
@@ -332,7 +332,7 @@ class Labeller:
         return number_frames(label, self.names, entry.length, self._source.fps, rest)
 
     def report(self) -> None:
-        """Print what was labelled."""
+        """Print the counts of labels."""
         if self._labels_success:
             counts = self._counts
             print(

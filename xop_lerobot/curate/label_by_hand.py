@@ -1,4 +1,4 @@
-"""Labels by hand: strips of images in files, and answers that are typed in the terminal."""
+"""Manual labelling: an image strip per episode in a file, answers typed in the terminal."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from xop_lerobot.curate.video import Cut, decode
 from xop_lerobot.evaluation.film import choose_moments, write_strip
 
 _STRIP = 8
-"""Images of a strip, evenly from the first to the last of an episode."""
+"""Images per strip, evenly spaced from the first to the last frame."""
 _LEAST_WIDTH = 160
-"""Width of an image that its label fits over [pixel]."""
+"""Smallest image width that fits the image's caption [px]."""
 
 HELP = (
     "s success   f failure   k keep as it is   b back   q stop\n"
@@ -28,18 +28,18 @@ HELP = (
 
 
 class LabelSession:
-    """Goes through episodes and keeps every answer in a file at once.
+    """Iterates over episodes and saves every answer at once.
 
-    Answers that the file holds already are not asked for again.
+    Episodes with an answer in the file are skipped.
 
     Args:
-        episodes: Indices of the episodes, in the order in which they are shown.
+        episodes: Indices of the episodes, in display order.
         path: File of the answers.
         names: Names of the sub-tasks, numbered from 1.
 
     Attributes:
         labels: Answers so far, by episode.
-        message: What the last key did, or why it did nothing.
+        message: Result of the last key, or why it had none.
     """
 
     def __init__(self, episodes: Sequence[int], path: Path, names: Sequence[str] = ()) -> None:
@@ -53,23 +53,23 @@ class LabelSession:
 
     @property
     def current(self) -> int | None:
-        """Index of the episode that is asked about; None when all is said."""
+        """Index of the current episode; None when all are answered."""
         if self._stopped or self._place >= len(self._episodes):
             return None
         return self._episodes[self._place]
 
     @property
     def progress(self) -> str:
-        """How far it is, in words."""
+        """Progress as text."""
         return f"episode {self.current} ({self._place + 1} of {len(self._episodes)})"
 
     @property
     def marks(self) -> Sequence[tuple[str, float]]:
-        """Sub-tasks that were set in this episode, and when they begin [s]."""
+        """Sub-tasks set in this episode, with their start times [s]."""
         return tuple(self._marks)
 
     def press(self, word: str) -> None:
-        """Do what a key, or a sub-task's number with the time after it, asks for."""
+        """Handle a key, or a sub-task's number followed by its start time."""
         actions: Mapping[str, Callable[[], None]] = {
             "s": lambda: self._answer(True),
             "f": lambda: self._answer(False),
@@ -98,7 +98,7 @@ class LabelSession:
         except (IndexError, ValueError):
             start = math.inf
         if not 0 <= start < math.inf:
-            self.message = f"say when it begins [s], such as '{number} 1.5'"
+            self.message = f"missing start time [s], such as '{number} 1.5'"
             return
         name = self._names[number - 1]
         self._marks = sorted([*self._marks, (name, start)], key=lambda mark: mark[1])
@@ -135,18 +135,18 @@ class LabelSession:
 def ask(
     source: Source, path: Path, names: Sequence[str], answers: TextIO | None = None
 ) -> dict[int, Label]:
-    """Ask somebody for labels, one episode after another.
+    """Ask the user for labels, episode by episode.
 
-    A strip of images of each episode is written beside the file of the answers.
+    An image strip of each episode is written beside the file of the answers.
 
     Args:
         source: The dataset.
         path: File of the answers.
         names: Names of the sub-tasks.
-        answers: Where the answers come from; standard input if None.
+        answers: Stream of the answers; standard input if None.
 
     Returns:
-        The labels in the file, those of former runs too.
+        All labels in the file, including those of earlier runs.
 
     Raises:
         BadDataset: If an episode has no images, or a video is not readable.
@@ -168,7 +168,7 @@ def ask(
             shown = index
         print("> ", end="", flush=True)
         line = (answers or sys.stdin).readline()
-        if not line:  # the end of the input stops as q does
+        if not line:  # end of input, same as q
             break
         session.press(line.strip())
         if session.message:
@@ -177,13 +177,13 @@ def ask(
 
 
 def read_images(source: Source, entry: EpisodeEntry, count: int) -> dict[str, np.ndarray]:
-    """Decode `count` images of an episode by camera, small ones enlarged for their labels.
+    """Decode `count` images of an episode per camera, enlarging small ones for their captions.
 
     Returns:
         Images by camera. Shapes (count, height, width, 3), uint8; fewer in shorter episodes.
 
     Raises:
-        BadDataset: If it has none, or a video is not readable.
+        BadDataset: If the episode has no images, or a video is not readable.
     """
     from xop_lerobot.curate.stats import read_pictures  # noqa: PLC0415 torch
 
@@ -198,11 +198,11 @@ def read_images(source: Source, entry: EpisodeEntry, count: int) -> dict[str, np
         elif feature["dtype"] == "image":
             strips[name] = list(read_pictures(source.read_table(entry)[key], wanted))
     if not strips or not all(strips.values()):
-        raise BadDataset(source.root, f"episode {entry.index} has no pictures to show")
+        raise BadDataset(source.root, f"episode {entry.index} has no images to show")
     return {name: _enlarge(np.stack(images)) for name, images in strips.items()}
 
 
 def _enlarge(images: np.ndarray) -> np.ndarray:
-    """Repeat the pixels of small images. Shape (n, h, w, 3)."""
+    """Enlarge small images by an integer factor. Shape (n, h, w, 3)."""
     factor = -(-_LEAST_WIDTH // images.shape[2])
     return images.repeat(factor, axis=1).repeat(factor, axis=2)

@@ -1,4 +1,4 @@
-"""Labels of episodes: whether they succeeded, and which sub-task began when."""
+"""Labels of episodes: success, and the start times of sub-tasks."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from xop_lerobot.core.folders import write_whole
 
 @dataclass(frozen=True)
 class Label:
-    """What is said of an episode.
+    """Label of an episode.
 
     Attributes:
-        success: Whether it succeeded; None leaves that as it is.
-        subtasks: Sub-tasks and when each begins [s], in their order.
+        success: Whether it succeeded; None leaves the present label.
+        subtasks: Sub-tasks with their start times [s], in order.
     """
 
     success: bool | None = None
@@ -32,10 +32,10 @@ class Label:
 
 
 def read_labels(path: Path) -> dict[int, Label]:
-    """Read labels by episode from a JSON file; empty if there is none.
+    """Read labels by episode from a JSON file; empty if there is no file.
 
     Raises:
-        BadValue: If it is malformed; says where.
+        BadValue: If it is malformed; the message says where.
     """
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
@@ -62,7 +62,7 @@ def read_labels(path: Path) -> dict[int, Label]:
 
 
 def write_labels(path: Path, labels: Mapping[int, Label]) -> None:
-    """Write labels; the file is there as a whole or as it was."""
+    """Write labels; the file is replaced atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, {str(index): labels[index].to_json() for index in sorted(labels)})
 
@@ -70,7 +70,7 @@ def write_labels(path: Path, labels: Mapping[int, Label]) -> None:
 def number_frames(
     label: Label, names: Sequence[str], length: int, fps: float, rest: int
 ) -> np.ndarray:
-    """Number the sub-task of each frame; `rest` before the first begins. Shape (n,)."""
+    """Index the sub-task of each frame; `rest` before the first one starts. Shape (n,)."""
     numbers = np.full(length, rest)
     for name, start in label.subtasks:
         numbers[max(0, round(start * fps)) :] = names.index(name)
@@ -78,7 +78,7 @@ def number_frames(
 
 
 def list_runs(numbers: np.ndarray, names: Sequence[str]) -> list[dict[str, Any]]:
-    """List which sub-task goes from which frame to before which."""
+    """List the runs of equal sub-tasks with their first frame and the frame after the last."""
     edges = np.flatnonzero(np.diff(numbers)) + 1
     starts, stops = [0, *edges.tolist()], [*edges.tolist(), len(numbers)]
     return [
@@ -88,11 +88,11 @@ def list_runs(numbers: np.ndarray, names: Sequence[str]) -> list[dict[str, Any]]
 
 
 def set_success(column: np.ndarray | None, length: int, success: bool) -> np.ndarray:
-    """Bring `next.success` in line with a label: true in the last frame, or nowhere.
+    """Set `next.success` to a label: True in the last frame, or nowhere.
 
     Args:
-        column: What it was; None where there was none. Shape (n, 1).
-        length: Frames.
+        column: Present values; None if there are none. Shape (n, 1).
+        length: Number of frames.
         success: The label.
     """
     values = np.zeros((length, 1), bool) if column is None else column.astype(bool).copy()

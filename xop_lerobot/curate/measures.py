@@ -1,4 +1,4 @@
-"""What figures are computed of the rows of an episode, from which columns."""
+"""Metrics of a recorded episode: definitions, required columns, and computation."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _FLAG, _NUMBER, _TEXT = Kind.FLAG, Kind.NUMBER, Kind.TEXT
 
 
 class Figure(NamedTuple):
-    """A figure.
+    """A metric.
 
     Attributes:
-        name: Its name in expressions and in JSON.
-        kind: What its value is, unless it is not known.
-        unit: Its unit; empty for flags, texts, counts and ratios.
-        text: What it is.
+        name: Name in expressions and JSON.
+        kind: Type of its value.
+        unit: Unit; empty for flags, texts, counts and ratios.
+        text: Description.
     """
 
     name: str
@@ -44,7 +44,9 @@ class Figure(NamedTuple):
 
 def _make_tracking(prefix: str, of: str) -> list[Figure]:
     return [
-        Figure(f"{prefix}_mean", _NUMBER, "m", f"mean distance of {of} from the goal, engaged"),
+        Figure(
+            f"{prefix}_mean", _NUMBER, "m", f"mean distance of {of} from the goal while engaged"
+        ),
         Figure(f"{prefix}_p95", _NUMBER, "m", "95th percentile of it"),
         Figure(f"{prefix}_angle_mean", _NUMBER, "rad", f"mean angle of {of} from the goal"),
         Figure(f"{prefix}_angle_p95", _NUMBER, "rad", "95th percentile of it"),
@@ -53,54 +55,54 @@ def _make_tracking(prefix: str, of: str) -> list[Figure]:
 
 _ALL = [
     Figure("episode", _NUMBER, "", "index of the episode"),
-    Figure("length", _NUMBER, "", "its frames"),
-    Figure("duration", _NUMBER, "s", "its time, frames over fps"),
+    Figure("length", _NUMBER, "", "number of frames"),
+    Figure("duration", _NUMBER, "s", "duration, frames over fps"),
     Figure("robot", _TEXT, "", "LeRobot's robot type"),
-    Figure("task", _TEXT, "", "task in words; several with ' | ' between"),
+    Figure("task", _TEXT, "", "task description; several joined by ' | '"),
     Figure("success", _FLAG, "", "the task was accomplished in the last frame"),
     Figure("fall", _FLAG, "", "the robot fell"),
-    Figure("collision", _FLAG, "", "it touched anything but the ground, itself included"),
-    Figure("trouble", _FLAG, "", "it moved though it was told to stand, or gave way"),
+    Figure("collision", _FLAG, "", "it touched itself, or anything but the ground"),
+    Figure("trouble", _FLAG, "", "it moved though it should stand, or gave way"),
     Figure("finished", _FLAG, "", "the operator's recording or script had played out"),
-    Figure("engaged_time", _NUMBER, "s", "time in which the operator drove"),
+    Figure("engaged_time", _NUMBER, "s", "time in which the operator was engaged"),
     *_make_tracking("tracking", "head and wrists, pooled,"),
     *(each for frame in FRAMES for each in _make_tracking(f"tracking_{frame}", frame)),
     Figure("command_roughness", _NUMBER, "1/s²", "RMS second difference over half the range"),
     Figure("command_ldlj", _NUMBER, "", "log dimensionless jerk of commands, higher is smoother"),
     Figure("hand_jerk", _NUMBER, "m/s³", "mean jerk of the robot's wrists"),
-    Figure("gaps", _NUMBER, "", "times that the device lost a limb, once engaged"),
-    Figure("gap_time", _NUMBER, "s", "time of all of them"),
-    Figure("gap_max", _NUMBER, "s", "time of the longest"),
+    Figure("gaps", _NUMBER, "", "number of tracking losses after the first engagement"),
+    Figure("gap_time", _NUMBER, "s", "their total duration"),
+    Figure("gap_max", _NUMBER, "s", "duration of the longest"),
     Figure("late", _FLAG, "", "a real-time episode ran at less than 95 % of its rate"),
-    Figure("late_frames", _NUMBER, "", "frames over 1.5 periods after the one before; real time"),
-    Figure("missing_frames", _NUMBER, "", "frames that the robot's clock went on without"),
-    Figure("dropped_frames", _NUMBER, "", "pictures that the video encoder dropped"),
-    Figure("real_fps", _NUMBER, "Hz", "frames a second of the host's clock"),
-    Figure("plan_age_mean", _NUMBER, "s", "mean age of the plan in force, engaged"),
+    Figure("late_frames", _NUMBER, "", "frames later than 1.5 periods (real-time clock only)"),
+    Figure("missing_frames", _NUMBER, "", "frames missing by the robot's clock"),
+    Figure("dropped_frames", _NUMBER, "", "images that the video encoder dropped"),
+    Figure("real_fps", _NUMBER, "Hz", "frames per second of the host clock"),
+    Figure("plan_age_mean", _NUMBER, "s", "mean age of the current plan while engaged"),
     Figure("plan_age_p95", _NUMBER, "s", "95th percentile of it"),
-    Figure("plan_age_max", _NUMBER, "s", "the oldest"),
-    Figure("solve_time_p95", _NUMBER, "s", "95th percentile of the time that a plan took"),
+    Figure("plan_age_max", _NUMBER, "s", "maximum"),
+    Figure("solve_time_p95", _NUMBER, "s", "95th percentile of the planning time"),
     Figure("unsolved", _NUMBER, "", "engaged frames without a new solution"),
-    Figure("idle_start", _NUMBER, "s", "time before anything happens"),
-    Figure("idle_end", _NUMBER, "s", "time after the last that happens"),
-    Figure("idle_time", _NUMBER, "s", "all time in which nothing happens"),
+    Figure("idle_start", _NUMBER, "s", "idle time before the first motion"),
+    Figure("idle_end", _NUMBER, "s", "idle time after the last motion"),
+    Figure("idle_time", _NUMBER, "s", "total idle time"),
     Figure("clock", _TEXT, "", "lockstep or realtime"),
     Figure("scene", _TEXT, "", "scene of the simulation"),
     Figure("low_level", _TEXT, "", "low-level policy"),
-    Figure("preset", _TEXT, "", "preset of the retargeter at the beginning"),
+    Figure("preset", _TEXT, "", "preset of the retargeter at the start"),
     Figure("seed", _NUMBER, "", "seed of the session"),
-    Figure("start_time", _NUMBER, "s", "host's clock at the first frame, since 1970"),
-    Figure("readable", _FLAG, "", "its rows and videos are there, whole and as announced"),
+    Figure("start_time", _NUMBER, "s", "host clock at the first frame, since 1970"),
+    Figure("readable", _FLAG, "", "its rows and videos are complete and match the metadata"),
 ]
 
 FIGURES = {figure.name: figure for figure in _ALL}
-"""Every figure by name, in the order in which they are written."""
+"""Every metric by name, in output order."""
 KINDS = {figure.name: figure.kind for figure in _ALL}
-"""What each is, for an `Expression`."""
+"""Type of each metric, for an `Expression`."""
 
 
 def describe_figures() -> str:
-    """List the figures, a line each, for `--help`."""
+    """List the metrics, one per line, for `--help`."""
     width = max(map(len, FIGURES))
     lines = []
     for figure in FIGURES.values():
@@ -120,21 +122,21 @@ ENGAGED, TRACKED, ACTION, HEALTH = (
 )
 BASE = "robot.base_pose"
 _STILL_SHARE = 0.02
-"""Share of its range within which an entry of the action of another's dataset counts as still."""
+"""Share of its range within which an action entry counts as stationary, without pose columns."""
 _ROBOT_PREFIX = "xop_"
 _POSE_SIZE = 7
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What a measure sees of an episode.
+    """Input of a measure.
 
     Attributes:
-        entry: What the metadata says.
+        entry: The episode's metadata.
         features: Features of the dataset.
-        rows: The columns that the measure asked for. Shapes (n, size).
+        rows: The columns that the measure needs. Shapes (n, size).
         dt: Time between frames [s].
-        robot: Name of the robot type, None if it is not known.
+        robot: LeRobot's robot type, None if unknown.
     """
 
     entry: EpisodeEntry
@@ -145,7 +147,7 @@ class Episode:
 
     @property
     def engaged(self) -> np.ndarray:
-        """Whether the operator drove; everywhere, where no column says. Shape (n,), bool."""
+        """Whether the operator drove; all True without that column. Shape (n,), bool."""
         if ENGAGED in self.rows:
             return self.rows[ENGAGED][:, 0].astype(bool)
         return np.ones(self.entry.length, bool)
@@ -157,12 +159,12 @@ class Episode:
 
 
 class Measure(NamedTuple):
-    """Some figures that come from the same columns.
+    """Metrics computed from the same columns.
 
     Attributes:
-        figures: Names of the figures.
-        find_columns: Tells which columns it takes; None if they cannot be computed here.
-        compute: Computes the figures.
+        figures: Names of the metrics.
+        find_columns: Returns the columns it needs; None if they are missing.
+        compute: Computes the metrics.
     """
 
     figures: tuple[str, ...]
@@ -171,7 +173,7 @@ class Measure(NamedTuple):
 
 
 def find_morphology(robot: str | None) -> Morphology | None:
-    """Find the morphology of a robot type; None for others' robots."""
+    """Return the morphology of a robot type; None for robots of other projects."""
     try:
         return _make_morphology((robot or "").removeprefix(_ROBOT_PREFIX))
     except UnknownName:
@@ -184,7 +186,7 @@ def _make_morphology(name: str) -> Morphology:
 
 
 def has_column(features: Features, name: str, size: int | None = None) -> bool:
-    """Whether there is a column of numbers or flags, of `size` entries if that is given."""
+    """Whether there is a numeric or boolean column, of `size` entries if given."""
     feature = features.get(name)
     if feature is None or feature["dtype"] in ("video", "image", "string"):
         return False
@@ -204,7 +206,7 @@ def _with_engaged(features: Features, columns: list[str]) -> tuple[str, ...] | N
     return (*columns, ENGAGED) if has_column(features, ENGAGED, 1) else tuple(columns)
 
 
-# Outcome, where the facts do not say.
+# Outcome, from the episode metadata or else from rows.
 
 
 def _find_success(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
@@ -270,7 +272,7 @@ def _compute_tracking(episode: Episode) -> Values:
         goal, pose = (
             np.asarray(episode.rows[f"{kind}.{frame}"], float) for kind in ("goal", "robot")
         )
-        # A goal of zeros is none: its quaternion has no length.
+        # A goal of zeros is a missing goal: its quaternion has no length.
         chosen = chosen & np.isfinite(goal).all(axis=1) & goal[:, 3:].any(axis=1)
         errors[frame] = compute_pose_errors(pose, goal)
     groups = {"tracking": list(errors.values())}
@@ -303,7 +305,7 @@ def _compute_command(episode: Episode) -> Values:
 
 
 def _scale(action: np.ndarray) -> np.ndarray:
-    """Scale each entry by its range in the episode; those that never change are left out."""
+    """Scale each entry by its range in the episode; constant entries are left out."""
     if not len(action):
         return action
     spread = np.ptp(action, axis=0)
@@ -333,7 +335,7 @@ def _compute_engaged(episode: Episode) -> Values:
 
 
 def _compute_gaps(episode: Episode) -> Values:
-    if not episode.engaged.any():  # nobody was there to be lost
+    if not episode.engaged.any():  # gaps are counted from the first engagement on
         return {"gaps": None, "gap_time": None, "gap_max": None}
     gaps = quality.find_gaps(episode.rows[TRACKED], episode.engaged)
     count, total, longest = quality.summarise_gaps(gaps, episode.dt)
@@ -341,7 +343,7 @@ def _compute_gaps(episode: Episode) -> Values:
 
 
 def _find_late(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | None:
-    # In lock-step the host's clock means nothing: frames take what the machine takes for them.
+    # In lock-step the host clock is irrelevant: a frame takes as long as its computation.
     is_realtime = entry.facts.get("clock") == "realtime"
     return ("time.wall",) if is_realtime and has_column(features, "time.wall", 1) else None
 
@@ -382,20 +384,20 @@ def _find_idle(features: Features, entry: EpisodeEntry) -> tuple[str, ...] | Non
 
 
 def find_idle(episode: Episode, limit: float = quality.STILL_LIMIT_M) -> np.ndarray:
-    """Find the idle frames, by the poses of person and robot, else by the action. Shape (n,).
+    """Find the idle frames by the poses of operator and robot, else by the action. Shape (n,).
 
-    Where a policy drove, nobody ever engaged, and it is the robot's motion that counts.
+    If nobody engaged, a policy drove, and only the motion counts.
 
     Args:
         episode: The episode, with the columns of `IDLE`.
-        limit: How far a point of a pose moves that stands still [m].
+        limit: Largest motion of a stationary pose's points [m].
     """
     engaged = episode.engaged if episode.engaged.any() else ~episode.engaged
     if ACTION in episode.rows:
         still = quality.find_still(_scale(episode.rows[ACTION]), episode.dt, _STILL_SHARE)
         return still | ~engaged
     poses = [rows for key, rows in episode.rows.items() if key != ENGAGED]
-    # Zeros are no pose: what was not seen, or not yet.
+    # Zeros are no pose: not tracked, or not yet.
     known = [pose for pose in poses if pose[:, 3:].any(axis=1).all()]
     return quality.find_idle(known, engaged, episode.dt, limit)
 
@@ -411,7 +413,7 @@ def _compute_idle(episode: Episode) -> Values:
 
 
 IDLE = Measure(("idle_start", "idle_end", "idle_time"), _find_idle, _compute_idle)
-"""Idle time; `find_columns` tells what `find_idle` takes."""
+"""Idle time; its `find_columns` names what `find_idle` needs."""
 
 MEASURES = (
     Measure(("success",), _find_success, _compute_success),
@@ -435,4 +437,4 @@ MEASURES = (
     ),
     IDLE,
 )
-"""All that is computed of rows."""
+"""All measures."""

@@ -1,8 +1,8 @@
-"""Put several datasets together to one, in the order in which they are named.
+"""Merge several datasets into one, in the order given.
 
-They must be of one robot, with one rate and the same columns. The facts on every episode come
-along, which LeRobot's own merge drops in part, and each episode says which dataset it is from.
-Pictures are copied, not encoded anew.
+They must have the same robot, rate and columns. The metadata of every episode, which LeRobot's own
+merge drops in part, is kept, and its `provenance` names the source dataset. Images are copied, not
+re-encoded.
 
     xop-curate merge --root outputs/monday outputs/tuesday --out outputs/week
 """
@@ -29,7 +29,7 @@ from xop_lerobot.curate.source import Source
 if TYPE_CHECKING:
     from xop_lerobot.curate.clip import Clip
 
-SUMMARY = "put datasets together"
+SUMMARY = "merge datasets into one"
 
 _COMPARED = ("dtype", "shape", "names")
 
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Merge datasets; returns the exit code."""
     roots = get_roots(arguments)
     if len({root.resolve() for root in roots}) < len(roots):
-        raise BadValue("--root names a dataset twice, whose episodes would be there twice")
+        raise BadValue("--root names a dataset twice, so its episodes would be duplicated")
     with ExitStack() as stack:
         sources = [stack.enter_context(Source(root)) for root in roots]
         check_alike(sources)
@@ -77,10 +77,10 @@ def _make_clips(sources: Sequence[Source], *, quiet: bool) -> Iterator[Clip]:
 
 
 def check_alike(sources: Sequence[Source]) -> None:
-    """Check that datasets have one rate, one robot and the same columns.
+    """Check that datasets have the same rate, robot and columns.
 
     Raises:
-        BadDataset: Naming the one that differs from the first, and in what.
+        BadDataset: If one differs from the first, naming the difference.
     """
     first = sources[0]
     for source in sources[1:]:
@@ -93,12 +93,12 @@ def check_alike(sources: Sequence[Source]) -> None:
                     source.root, f"its {name} is {value}, that of '{first.root}' is {expected}"
                 )
         for words, keys in (
-            ("it has not the column", first.features.keys() - source.features.keys()),
-            ("it has a column more,", source.features.keys() - first.features.keys()),
+            ("missing column", first.features.keys() - source.features.keys()),
+            ("extra column", source.features.keys() - first.features.keys()),
         ):
             if keys:
                 raise BadDataset(
-                    source.root, f"{words} {', '.join(sorted(keys))}, unlike '{first.root}'"
+                    source.root, f"{words} {', '.join(sorted(keys))}, compared with '{first.root}'"
                 )
         for key, feature in source.features.items():
             for name in _COMPARED:
@@ -112,7 +112,7 @@ def check_alike(sources: Sequence[Source]) -> None:
 
 
 def merge_video_features(sources: Sequence[Source]) -> Mapping[str, Any]:
-    """Say of videos what is true of all datasets, as LeRobot's own merge does."""
+    """Return the video features that hold for all datasets, as LeRobot's merge computes them."""
     from lerobot.datasets.aggregate import (  # noqa: PLC0415 torch
         merge_video_feature_info_for_aggregate,
     )

@@ -1,6 +1,6 @@
-"""Whether episodes, rows and times are numbered and told as LeRobot takes for granted.
+"""Check that episodes, rows and times are numbered as LeRobot assumes.
 
-None of this makes rows or pictures unreadable: every verb that writes a dataset counts anew.
+No fault here makes rows or images unreadable: every verb that writes a dataset renumbers it.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from xop_lerobot.operator.dataset_recording import CLOCKS
 from xop_lerobot.operator.recording import FARTHEST_M
 from xop_lerobot.operator.row_clock import LONGEST_HOLD_S, read_row_clock
 
-_ANEW = "`xop-curate filter` counts anew"
+_ANEW = "`xop-curate filter` renumbers it"
 _TOLERANCE_S = 1e-4
-"""How far LeRobot lets the time stamp of a row be from that of its picture [s]."""
+"""LeRobot's tolerance between the time stamps of a row and of its image [s]."""
 _POSES = ("operator.", "goal.", "robot.")
 _POSE_SIZE = 7
 
 
 class OrderCheck:
-    """Looks at one episode after another, all of them, in the order of the metadata.
+    """Checks all episodes, one after another in the order of the metadata.
 
     Args:
         source: The dataset.
@@ -53,22 +53,22 @@ class OrderCheck:
             and list(features[name]["shape"]) == [size]
             and features[name]["dtype"].startswith(("float", "int"))
         )
-        """Columns that are looked at."""
+        """Columns that are checked."""
         self._number = self._row = 0
         try:
             self._words = read_tasks(source.root)
-        except BadDataset:  # which is told of the dataset as a whole
+        except BadDataset:  # reported by `check_whole`
             self._words = {}
 
     def check(self, entry: EpisodeEntry, rows: Mapping[str, np.ndarray] | None) -> list[str]:
-        """Say what is not as it should be.
+        """List the faults of the next episode.
 
         Args:
-            entry: The next episode.
-            rows: Its `columns`, None where they are not known. Shapes (n, size).
+            entry: The episode.
+            rows: Its `columns`, None if unknown. Shapes (n, size).
         """
         length = entry.length
-        if not length and entry.place is not None:  # it is not stated, but where it lies is
+        if not length and entry.place is not None:  # the length is not stated, but the rows are
             length = max(0, entry.place[1] - entry.place[0])
         place = (self._row, self._row + length)
         number, self._number, self._row = self._number, entry.index + 1, place[1]
@@ -76,12 +76,12 @@ class OrderCheck:
         if entry.index != number:
             before = f"comes after {number - 1}" if number else "is the first"
             problems.append(
-                f"episode {entry.index} {before}, but LeRobot takes episodes to be numbered from 0 "
-                f"without a gap. {_ANEW}"
+                f"episode {entry.index} {before}, but LeRobot assumes episodes numbered from 0 "
+                f"without gaps. {_ANEW}"
             )
         if entry.place is not None and entry.place != place:
             problems.append(
-                f"episode {entry.index} is said to be the rows {_say(entry.place)} of the dataset, "
+                f"the metadata puts episode {entry.index} at the rows {_say(entry.place)}, "
                 f"it is the rows {_say(place)}. {_ANEW}"
             )
         if rows is not None and entry.length:
@@ -96,7 +96,7 @@ class OrderCheck:
     ) -> Iterator[str]:
         frames, fps = np.arange(entry.length), self._source.fps
         stamps = frames / fps
-        # As exact as 32 bits are, which LeRobot stores.
+        # LeRobot stores time stamps as float32.
         slack = _TOLERANCE_S + np.spacing(stamps.astype(np.float32)).astype(float)
         for name, expected, slacks in (
             ("frame_index", frames, 0.5),
@@ -139,7 +139,7 @@ def _check_clocks(entry: EpisodeEntry, rows: Mapping[str, np.ndarray]) -> Iterat
     for name, unit in CLOCKS.items():
         if name not in rows or name == "timestamp":
             continue
-        # A shorter step may be a pause of the recorder, which other figures tell.
+        # A shorter step may be a pause of the recorder, which other metrics show.
         jumps = [
             jump
             for jump in read_row_clock(rows[name][:, 0], unit).jumps
@@ -170,19 +170,19 @@ def _check_distances(
 
 
 def check_whole(source: Source, frames: int) -> list[str]:
-    """Say what is not as it should be of a dataset as a whole.
+    """List the faults of a dataset as a whole.
 
     Args:
         source: The dataset.
-        frames: How many frames its episodes have.
+        frames: Number of frames of its episodes.
     """
     problems = []
     try:
         read_tasks(source.root)
         if not has_index_of_words(source.root):
             problems.append(
-                f"{TASKS_FILE} has the words of the tasks in a column, LeRobot looks for them in "
-                "the index and shows numbers. `xop-curate filter` writes it anew"
+                f"{TASKS_FILE} has the task descriptions in a column, LeRobot reads them from the "
+                "index and shows numbers instead. `xop-curate filter` rewrites it"
             )
     except BadDataset as error:
         if frames:
@@ -204,11 +204,11 @@ def check_whole(source: Source, frames: int) -> list[str]:
 
 
 def _count_rows(source: Source) -> int:
-    """Count the rows of all readable data files, by their footers."""
+    """Count the rows of all readable data files by their footers."""
     rows = 0
     for path in source.root.glob("data/*/*.parquet"):
         try:
             rows += pq.read_metadata(path).num_rows
-        except UNREADABLE:  # which is told of its episodes
+        except UNREADABLE:  # reported for its episodes
             continue
     return rows

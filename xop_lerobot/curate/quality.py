@@ -1,8 +1,7 @@
-r"""How good a recorded episode is: pure functions of its columns.
+r"""Quality measures of a recorded episode: pure functions of its columns.
 
-Arrays have one row for each frame, `n` in all, at a time step of `dt` seconds. Poses are
-x y z qw qx qy qz. What a figure would be an average of may never have come (the operator never
-engaged); the figure is nan then.
+Arrays have one row per frame, `n` in all, at a time step of `dt` seconds. Poses are x y z qw qx qy
+qz. A metric whose average has no samples (such as when the operator never engaged) is nan.
 
 Tracking errors, jerk, roughness and falls are those of `xop_lerobot.evaluation.metrics`.
 
@@ -26,25 +25,25 @@ from xop_lerobot.core.transforms import quat_rotate
 from xop_lerobot.evaluation.metrics import NEVER, find_runs
 
 STILL_WINDOW_S = 0.5
-"""Time within which a thing that stands still does not leave its place [s]."""
+"""Time window in which a stationary pose must not move [s]."""
 STILL_LIMIT_M = 0.04
-"""How far the points of a pose that stands still move within that time [m]. The sway of a standing
-person stays below, and so does a G1 that balances, whose wrists give by 3 cm when it is engaged."""
+"""Largest motion of a stationary pose's points within that window [m]. A standing person's sway
+stays below, as does a balancing G1, whose wrists give by 3 cm when it is engaged."""
 LEVER_M = 0.3
-"""Distance from a pose's origin at which its turning counts as motion [m]."""
+"""Lever arm at which the rotation of a pose counts as motion [m]."""
 LDLJ_WINDOW_S = 2.0
-"""Length of the pieces that smoothness is computed of [s]: about that of one movement."""
+"""Length of the segments over which smoothness is computed [s], about one movement."""
 LATE_FACTOR = 1.5
-"""A frame is late if it came this many periods after the one before."""
+"""A frame is late if it comes more than so many periods after its predecessor."""
 
 
 class GapFigures(NamedTuple):
-    """For how long the device did not see the operator.
+    """Tracking losses of an episode.
 
     Attributes:
         number: Number of gaps.
-        total: Their time [s].
-        longest: Time of the longest [s].
+        total: Total duration [s].
+        longest: Duration of the longest [s].
     """
 
     number: int
@@ -61,7 +60,7 @@ class SpreadFigures(NamedTuple):
 
 
 def summarise_spread(values: np.ndarray) -> SpreadFigures:
-    """Summarise a quantity. Shape (n,); all nan if n is 0."""
+    """Summarise a quantity of shape (n,); all nan if n is 0."""
     if not values.size:
         return SpreadFigures(NEVER, NEVER, NEVER)
     return SpreadFigures(
@@ -72,27 +71,29 @@ def summarise_spread(values: np.ndarray) -> SpreadFigures:
 def compute_ldlj(
     path: np.ndarray, dt: float, chosen: np.ndarray | None = None, window_s: float = LDLJ_WINDOW_S
 ) -> float:
-    r"""Compute the log dimensionless jerk, :math:`-\ln\frac{T^3}{v_{peak}^2}\int\lVert\dddot x\rVert^2 dt`.
+    r"""Compute the log dimensionless jerk of a path.
 
-    It does not depend on the size of a movement [1, 2], and the higher the smoother; a movement of
-    minimum jerk over all of T has :math:`-\ln 204.8 = -5.3`. Since it depends on how many movements
-    there are in T, it is taken of pieces of one length T = `window_s`, and the median over the
-    pieces in which anything moves is given.
+    .. math:: -\ln\frac{T^3}{v_{peak}^2}\int\lVert\dddot x\rVert^2 dt
+
+    It is independent of a movement's amplitude [1, 2]; higher is smoother. A minimum-jerk movement
+    over all of T has :math:`-\ln 204.8 = -5.3`. As it depends on the number of movements within T,
+    it is computed over segments of length T = `window_s`; the result is the median over segments
+    with motion.
 
     Args:
-        path: What should be smooth; its entries must be of comparable size. Shape (n, k).
+        path: Trajectory; its entries must be of comparable size. Shape (n, k).
         dt: Time between frames [s].
-        chosen: Frames that count, all where None; no piece reaches beyond a run of them.
-            Shape (n,), bool.
-        window_s: Length of a piece [s].
+        chosen: Frames to use, None for all; no segment crosses the end of a run of them. Shape
+            (n,), bool.
+        window_s: Length of a segment [s].
 
     Returns:
-        Log dimensionless jerk, nan if nothing moves for as long as one piece.
-    """  # noqa: E501 the formula
+        Log dimensionless jerk, nan if no segment has motion.
+    """
     if path.ndim != 2:
         raise BadShape("path", ("n", "k"), path.shape)
     size = round(window_s / dt) + 1
-    if size < 4:  # a jerk takes four points
+    if size < 4:  # the third difference needs four points
         return NEVER
     values = []
     for first, last in find_runs(np.ones(len(path), bool) if chosen is None else chosen):
@@ -108,14 +109,14 @@ def compute_ldlj(
 
 
 def find_gaps(tracked: np.ndarray, engaged: np.ndarray) -> np.ndarray:
-    """Find the frames in which the device did not see all of the operator, once they had engaged.
+    """Find the frames in which the device lost the operator, after the first engagement.
 
     Args:
-        tracked: Whether each limb was seen. Shape (n, limbs), bool.
+        tracked: Whether each limb was tracked. Shape (n, limbs), bool.
         engaged: Whether the operator drove. Shape (n,), bool.
 
     Returns:
-        Whether something was not seen; never before the first engaged frame. Shape (n,), bool.
+        Whether a limb was lost; False before the first engaged frame. Shape (n,), bool.
     """
     if not engaged.any():
         return np.zeros(len(engaged), bool)
@@ -125,23 +126,23 @@ def find_gaps(tracked: np.ndarray, engaged: np.ndarray) -> np.ndarray:
 
 
 def summarise_gaps(gaps: np.ndarray, dt: float) -> GapFigures:
-    """Count and time the runs of `gaps`. Shape (n,), bool."""
+    """Count and time the runs in `gaps`, of shape (n,), bool."""
     times = [(last - first) * dt for first, last in find_runs(gaps)]
     return GapFigures(len(times), float(sum(times)), float(max(times, default=0.0)))
 
 
 def count_late(stamps: np.ndarray, dt: float) -> int:
-    """Count the frames that came more than one and a half periods after the one before.
+    """Count the frames later than `LATE_FACTOR` periods after their predecessor.
 
     Args:
-        stamps: Clock of each frame [s]. Shape (n,).
-        dt: Period that they should have [s].
+        stamps: Time stamp of each frame [s]. Shape (n,).
+        dt: Nominal period [s].
     """
     return int((np.diff(stamps) > LATE_FACTOR * dt).sum())
 
 
 def count_missing(stamps: np.ndarray, dt: float) -> int:
-    """Count the frames that should lie between those that are there. Same arguments."""
+    """Count the frames missing between recorded ones; arguments as `count_late`."""
     steps = np.round(np.diff(stamps) / dt)
     return int(np.maximum(steps - 1, 0).sum())
 
@@ -149,30 +150,30 @@ def count_missing(stamps: np.ndarray, dt: float) -> int:
 def find_still(
     points: np.ndarray, dt: float, limit: float, window_s: float = STILL_WINDOW_S
 ) -> np.ndarray:
-    """Find the frames around which nothing moves: no entry's range within the window is over `limit`.
+    """Find the frames around which no entry's range within the window exceeds `limit`.
 
     Args:
-        points: What may move. Shape (n, k).
+        points: Quantities to watch. Shape (n, k).
         dt: Time between frames [s].
         limit: Largest range [unit of the points].
         window_s: Length of the window, centred on the frame [s].
 
     Returns:
-        Whether all stands still. Shape (n,), bool.
-    """  # noqa: E501 one sentence
+        Whether all are stationary. Shape (n,), bool.
+    """
     if not points.size:
         return np.ones(len(points), bool)
     size = 2 * max(round(window_s / dt / 2), 1) + 1
-    # The axis that is filtered comes last, where it is contiguous.
+    # Filtering along the last axis is faster: it is contiguous.
     rows = np.ascontiguousarray(points.T)
     high = maximum_filter1d(rows, size, axis=1, mode="nearest")
     low = minimum_filter1d(rows, size, axis=1, mode="nearest")
-    with np.errstate(invalid="ignore"):  # what is not finite does not stand still
+    with np.errstate(invalid="ignore"):  # non-finite values count as moving
         return np.asarray((high - low <= limit).all(axis=0))
 
 
 def make_points(pose: np.ndarray) -> np.ndarray:
-    """Stand for a pose by its origin and two points on its X and Y axis, which turn with it.
+    """Represent a pose by its origin and a point on its X and on its Y axis, at `LEVER_M`.
 
     Shape (n, 7) -> (n, 9) [m].
     """
@@ -185,13 +186,13 @@ def make_points(pose: np.ndarray) -> np.ndarray:
 def find_idle(
     poses: Sequence[np.ndarray], engaged: np.ndarray, dt: float, limit: float = STILL_LIMIT_M
 ) -> np.ndarray:
-    """Find the frames in which nothing happens: nobody drives, or neither person nor robot moves.
+    """Find the frames in which nobody is engaged, or neither operator nor robot moves.
 
     Args:
-        poses: Poses of the operator and of the robot. Shapes (n, 7).
-        engaged: Whether the operator drove. Shape (n,), bool.
+        poses: Poses of operator and robot. Shapes (n, 7).
+        engaged: Whether the operator is engaged. Shape (n,), bool.
         dt: Time between frames [s].
-        limit: How far a point of a pose moves that stands still [m].
+        limit: Largest motion of a stationary pose's points [m].
 
     Returns:
         Whether the frame is idle. Shape (n,), bool.
@@ -206,7 +207,7 @@ def find_idle(
 
 
 def find_active_span(idle: np.ndarray) -> tuple[int, int]:
-    """Find the first frame that is not idle, and the one after the last; (n, n) if all are."""
+    """Return the first non-idle frame and the one after the last; (n, n) if all are idle."""
     active = np.flatnonzero(~np.asarray(idle, bool))
     if not active.size:
         return len(idle), len(idle)

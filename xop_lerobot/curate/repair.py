@@ -1,14 +1,14 @@
-"""Restore a recording that was cut off, to its last whole episode.
+"""Restore an interrupted recording, up to its last complete episode.
 
-A recorder that is killed, a full disk, or a copy that broke off leaves metadata that is missing or
-does not fit. Every episode of which all rows and images are there is kept; what is lost is said,
-with the reason. Nothing is guessed: rows that were not written yet are gone.
+A killed recorder, a full disk or an interrupted copy leaves metadata that is missing or
+inconsistent. Every episode with all rows and images is kept; lost episodes are listed with the
+reason. Nothing is guessed: rows that were not written are lost.
 
     xop-curate repair --root outputs/killed --out outputs/restored
 
-Recordings of `xop-record`, and those of `lerobot-record` with this project's robots, load after a
-kill as they are; this cleans up behind them. LeRobot's own recorder leaves Parquet files without a
-footer, whose rows cannot be read.
+Recordings of `xop-record`, and of `lerobot-record` with this project's robots, load after a kill
+without repair; this only removes leftover files. LeRobot's own recorder leaves Parquet files
+without a footer, whose rows cannot be read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from xop_lerobot.curate.clip import Clip
     from xop_lerobot.curate.damaged import DamagedDataset
 
-SUMMARY = "restore a recording that was cut off"
+SUMMARY = "restore an interrupted recording"
 
 
 def add_arguments(parser: CommandParser) -> None:
@@ -70,13 +70,13 @@ def _make_clips(damaged: DamagedDataset, *, quiet: bool) -> Iterator[Clip]:
 
 
 def report(damaged: DamagedDataset) -> None:
-    """Print what was found, what is kept and what is lost."""
+    """Print findings, complete episodes and lost ones."""
     for note in damaged.notes:
         print(note)
     for index, reason in sorted(damaged.lost.items()):
         print(f"episode {index} is lost: {reason}")
     if not damaged.notes and not damaged.lost:
-        print("nothing is wrong with it")
+        print("no damage found")
     frames = sum(entry.length for entry in damaged.entries)
     whole = f"{say_count(len(damaged.entries), 'episode')}, {say_count(frames, 'frame')}"
-    print(f"whole: {whole}. Lost: {len(damaged.lost)}")
+    print(f"complete: {whole}. Lost: {len(damaged.lost)}")

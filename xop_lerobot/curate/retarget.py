@@ -1,16 +1,16 @@
-"""Replay recorded operators through the simulator, with another robot or another retargeter.
+"""Replay recorded operators in simulation, with another robot, retargeter or low-level policy.
 
-What the operator did is read from `operator.*`; everything else is made anew, as `xop-record` would
-have recorded it. So a session of one robot becomes a session of another, or of other weights, or of
-another low-level policy. Recordings of hardware play too: where tracking was lost or the operator
-had let go, the new robot holds, and clocks may jitter.
+The operator's motion is read from `operator.*`; everything else is simulated and recorded again, as
+by `xop-record`. So a session with one robot becomes a session with another, with other weights, or
+with another low-level policy. Recordings of hardware work, too: where tracking was lost or the
+operator disengaged, the new robot holds, and clocks may jitter.
 
     xop-curate retarget --root outputs/g1 --out outputs/rby1 --robot rby1
 
-The same flags and source give the same rows, with any number of workers, but for `time.wall` and
-the solve times in `retargeter.health`. It may be killed at any moment: until all is whole, it lies
-in `<out>.collecting`, and the same command goes on with the finished episodes. More `--episodes`
-add to a dataset. Every episode's `provenance` says which episode of which dataset it came from.
+The same flags and source give the same rows with any number of workers, except for `time.wall` and
+the solve times in `retargeter.health`. The command may be killed at any moment: until it is
+complete, the dataset is in `<out>.collecting`, and the same command resumes with the missing
+episodes. More `--episodes` extend a dataset. Every episode's `provenance` names its source episode.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from xop_lerobot.collect.config import add_config, add_crew, read_config
+from xop_lerobot.collect.config import add_config, add_worker_flags, read_config
 from xop_lerobot.collect.folder import CollectFolder
 from xop_lerobot.collect.run import Collection, run_collection
 from xop_lerobot.core.command_line import INTERRUPTED, CommandParser, format_table, say_count
@@ -43,7 +43,7 @@ from xop_lerobot.curate.source import EpisodeEntry, Source
 from xop_lerobot.morphology.morphology import read_robot, say_robots
 from xop_lerobot.recording.facts import FACTS_DIR
 
-SUMMARY = "replay the operators with another robot, retargeter or policy"
+SUMMARY = "replay recorded operators with another robot, retargeter or policy"
 
 _FIGURES = {
     "duration": "time [s]",
@@ -54,11 +54,11 @@ _FIGURES = {
     "fall": "fall",
     "collision": "collision",
 }
-"""Figures of the new episodes that are shown, and their heads."""
+"""Metrics shown for the new episodes, and their column heads."""
 
 
 class RetargetFolder(CollectFolder):
-    """Files of a retargeting while it runs."""
+    """Files of a retargeting in progress."""
 
     command = "xop-curate retarget"
     flag = "--out"
@@ -73,9 +73,9 @@ def add_arguments(parser: CommandParser) -> None:
         "--out",
         type=Path,
         metavar="DIR",
-        help="directory of the new dataset; the source stays as it is",
+        help="directory of the new dataset; the source is not changed",
     )
-    add("--dry-run", action="store_true", help="say what would be replayed, and do nothing")
+    add("--dry-run", action="store_true", help="report what would be replayed, without replaying")
     add("--robot", required=True, type=read_robot, help=f"robot: {say_robots()}")
     add(
         "--episodes",
@@ -89,20 +89,20 @@ def add_arguments(parser: CommandParser) -> None:
         default=RetargetConfig.hold_s,
         dest="hold_s",
         metavar="S",
-        help="how long the last posture is held, for the robot to arrive [s] "
+        help="time the last posture is held for the robot to arrive [s] "
         f"(default: {RetargetConfig.hold_s:g})",
     )
     add(
         "--task",
         default="",
         metavar="NAME",
-        help="set the scene of this task and judge its success (default: none)",
+        help="task whose scene is set up and whose success is judged (default: none)",
     )
     settings = {"nargs": "+", "action": "extend", "default": [], "metavar": "KEY=VALUE"}
     add(
         "--weights",
         type=_read_weight,
-        help="cost weights over those of the preset, such as position=2 (default: none)",
+        help="cost weights that override the preset's, such as position=2 (default: none)",
         **settings,
     )
     add(
@@ -117,7 +117,7 @@ def add_arguments(parser: CommandParser) -> None:
         help="settings of --teleop.alignment, such as walk_scale=0.8 (default: none)",
         **settings,
     )
-    add_crew(parser)
+    add_worker_flags(parser)
     add_config(
         parser,
         RetargetConfig,
@@ -125,7 +125,7 @@ def add_arguments(parser: CommandParser) -> None:
         f"(default: the source's, {DEFAULT_FPS} if that does not)",
     )
     parser.set_defaults(fps=0)
-    add("--json", type=Path, metavar="FILE", help="write the figures of each episode as JSON")
+    add("--json", type=Path, metavar="FILE", help="write the metrics of each episode as JSON")
 
 
 def _read_weight(pair: str) -> dict[str, Any]:
@@ -147,7 +147,7 @@ def _read_alignment(pair: str) -> dict[str, Any]:
 def run(arguments: argparse.Namespace) -> int:
     """Retarget a dataset; returns the exit code."""
     if arguments.out is None and not arguments.dry_run:
-        raise BadValue("say where the new dataset goes: --out=DIR, or --dry-run")
+        raise BadValue("missing output: pass --out=DIR, or --dry-run")
     if arguments.json is not None and not arguments.json.resolve().parent.is_dir():
         raise BadValue(f"--json: there is no directory '{arguments.json.parent}'")
     if arguments.workers < 0:
@@ -180,7 +180,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def make_config(arguments: argparse.Namespace, source: Source) -> RetargetConfig:
-    """Make the configuration that the flags ask for."""
+    """Make the configuration from the flags."""
     settings = {
         name: {key: value for pair in getattr(arguments, name) for key, value in pair.items()}
         for name in ("weights", "retargeter", "alignment")
@@ -196,7 +196,7 @@ def make_config(arguments: argparse.Namespace, source: Source) -> RetargetConfig
 
 
 def make_step(config: RetargetConfig) -> Step:
-    """Make the step that the new episodes remember: what is not as by default."""
+    """Make the step for the provenance, with all settings that differ from their defaults."""
     given = {
         each.name: getattr(config, each.name)
         for each in dataclasses.fields(config)
@@ -208,10 +208,10 @@ def make_step(config: RetargetConfig) -> Step:
 
 
 def choose_episodes(source: Source, wanted: Sequence[int] | None) -> list[int]:
-    """Choose the episodes of a source: the wanted ones, else all.
+    """Choose the wanted episodes of a source, or all.
 
     Raises:
-        BadDataset: If it has none, or lacks one of them.
+        BadDataset: If it has none, or lacks a wanted one.
     """
     there = [entry.index for entry in source.episodes]
     if not there:
@@ -227,16 +227,16 @@ def choose_episodes(source: Source, wanted: Sequence[int] | None) -> list[int]:
 
 
 def check_apart(source: Source, folder: CollectFolder) -> None:
-    """Check that the new dataset does not lie in the source, or the other way round.
+    """Check that the new dataset and the source do not lie inside each other.
 
     Raises:
-        FolderTaken: If it does.
+        FolderTaken: If they do.
     """
     held = source.root.resolve()
     if folder.root.is_relative_to(held) or held.is_relative_to(folder.root):
         raise FolderTaken(
-            f"'{folder.root}' and the dataset '{source.root}' lie in each other. Choose another "
-            f"{folder.flag}"
+            f"'{folder.root}' and the dataset '{source.root}' must not contain each other. Choose "
+            f"another {folder.flag}"
         )
 
 
@@ -253,7 +253,7 @@ def show_plan(jobs: Iterable[RetargetJob]) -> None:
 
 
 def report(root: Path, collection: Collection, path: Path | None) -> None:
-    """Print the figures of the new episodes, and write them as JSON where `path` says.
+    """Print the metrics of the new episodes, and write them as JSON to `path`, if given.
 
     Raises:
         XopError: If there are no new episodes.
@@ -283,7 +283,7 @@ def report(root: Path, collection: Collection, path: Path | None) -> None:
 
 
 def find_origin(entry: EpisodeEntry) -> int | None:
-    """Find which episode of its source an episode was made of; None if nothing says."""
+    """Return the source episode of an episode by its provenance; None if unknown."""
     provenance = entry.facts.get(PROVENANCE)
     last = provenance[-1] if isinstance(provenance, list) and provenance else {}
     return last.get("source_episode") if isinstance(last, Mapping) else None

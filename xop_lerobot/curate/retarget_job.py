@@ -1,4 +1,4 @@
-"""The operators of a recorded dataset, one after another, as jobs for the workers."""
+"""Jobs of `xop-curate retarget`: the recorded operators of a dataset, and the configuration."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RetargetJob:
-    """One recorded operator.
+    """Replay of one recorded operator.
 
     Attributes:
-        index: Index of the episode in the source.
-        recording: What the operator did; None if it cannot be replayed.
-        fault: Why not.
-        tasks: The task in words, and the time on the recording's clock from which it is that [s].
-        facts: Facts on the new episode that its recorder does not know.
+        index: Episode index in the source.
+        recording: The operator's motion; None if it cannot be replayed.
+        fault: Why it cannot be replayed.
+        tasks: Task descriptions with the recording time from which each applies [s].
+        facts: Metadata of the new episode that its recorder does not know.
     """
 
     index: int
@@ -49,10 +49,10 @@ class Operators:
 
     Args:
         source: The dataset.
-        step: What is being done to it, for the `provenance` of the new episodes.
+        step: The present step, for the `provenance` of the new episodes.
 
     Raises:
-        BadRecording: If it lacks columns of an operator, listing those that it has.
+        BadRecording: If the dataset lacks operator columns, listing those that it has.
     """
 
     def __init__(self, source: Source, step: Step) -> None:
@@ -61,10 +61,7 @@ class Operators:
         self._names: dict[int, str] | None = None
 
     def read(self, indices: Collection[int]) -> Iterator[RetargetJob]:
-        """Read those of the episodes `indices`, in order.
-
-        What cannot be replayed comes all the same, with the fault.
-        """
+        """Yield jobs for the episodes `indices`, in order, with a fault if not replayable."""
         wanted = set(indices)
         for entry in self._source.episodes:
             if entry.index in wanted:
@@ -87,7 +84,7 @@ class Operators:
     def _find_tasks(
         self, entry: EpisodeEntry, rows: np.ndarray, stamps: np.ndarray
     ) -> tuple[tuple[float, str], ...]:
-        """Find the tasks in words, and from when on they are those [s]."""
+        """Return task descriptions with the time from which each applies [s]."""
         if len(entry.tasks) == 1 or TASK not in self._source.features:
             return ((0.0, " | ".join(entry.tasks)),)
         numbers = self._source.read(entry, [TASK])[TASK][rows, 0]
@@ -102,24 +99,24 @@ class Operators:
 
 
 DEVICE = "retarget"
-"""Name of the device that plays the recorded operators."""
+"""Name of the device that replays the operators."""
 DEFAULT_FPS = 25
-"""Rate of a dataset whose source has one that the robots cannot run at [Hz]."""
+"""Rate of the new dataset if the robots cannot run at that of the source [Hz]."""
 POLICY_HZ = 50
 
 
 @dataclass(frozen=True)
 class RetargetConfig(CollectConfig):
-    """What decides the content of a retargeted dataset; equal ones give equal episodes.
+    """Configuration of a retargeted dataset; equal configurations give equal episodes.
 
     Attributes:
-        task: Task whose furniture and success there shall be; empty for none.
-        fps: Rate of the control loop and of the dataset [Hz].
+        task: Task whose scene is set up and whose success is judged; empty for none.
+        fps: Rate of control loop and dataset [Hz].
         device: Always `DEVICE`.
-        source: Directory of the dataset that is replayed.
-        name: Its name, for the configuration that the new dataset keeps.
-        hold_s: How long the operator's last posture is held, for the robot to arrive [s].
-        weights: Cost weights by name, over those of the preset.
+        source: Directory of the source dataset.
+        name: Name of the source dataset, kept in the new dataset's configuration.
+        hold_s: Time the operator's last posture is held for the robot to arrive [s].
+        weights: Cost weights by name, overriding the preset's.
         retargeter: Other settings of `RetargeterConfig` by name.
         alignment: Settings of `AlignmentConfig` by name.
     """
@@ -136,7 +133,7 @@ class RetargetConfig(CollectConfig):
     maker: ClassVar[str] = "xop_lerobot.curate.retarget_worker:Replayer"
 
     def check(self) -> None:
-        """Check all that can be checked before a robot is made; imports the plugins.
+        """Check everything that does not need a robot; imports the plugins.
 
         Raises:
             UnknownName: If there is no such robot, task, policy, noise, method or variant.
@@ -152,8 +149,8 @@ class RetargetConfig(CollectConfig):
         make_settings(self.morphology, retargeter)
         if self.weights and retargeter.type != "mpc":
             raise BadValue(
-                f"weights are those of the planner, and a retargeter '{retargeter.type}' has none. "
-                "Use --method=mpc, or leave --weights out"
+                f"--weights needs the planner, but the retargeter is '{retargeter.type}'. "
+                "Use --method=mpc, or omit --weights"
             )
 
     def make_teleop_config(self) -> XopConfig:
@@ -170,14 +167,14 @@ class RetargetConfig(CollectConfig):
         )
 
     def describe(self, attempt: Attempt) -> str:
-        """Say in a few words what came of an episode."""
+        """Describe the outcome of an episode in a few words."""
         if not attempt.kept:
             return f"left out ({attempt.failure})"
         return super().describe(attempt) if self.task else "retargeted"
 
 
 def choose_fps(wanted: int, source: float) -> int:
-    """Choose the rate of the new dataset [Hz]: the wanted one, else the source's if robots can."""
+    """Choose the rate of the new dataset [Hz]: the wanted one, else the source's if supported."""
     if wanted:
         return wanted
     can = float(source).is_integer() and source >= 1 and POLICY_HZ % int(source) == 0
@@ -185,15 +182,15 @@ def choose_fps(wanted: int, source: float) -> int:
 
 
 def read_settings(kind: type, what: str, pairs: Sequence[str]) -> dict[str, Any]:
-    """Read `KEY=VALUE` pairs as fields of a dataclass.
+    """Parse `KEY=VALUE` pairs as fields of a dataclass.
 
     Args:
         kind: The dataclass.
-        what: What they are, for messages.
-        pairs: The pairs; values as in YAML.
+        what: Description of the settings for messages.
+        pairs: The pairs; values in YAML syntax.
 
     Raises:
-        UnknownName: If there is no such field, listing those that there are.
+        UnknownName: If there is no such field, listing the known ones.
         BadValue: If a pair or a value is malformed.
     """
     import typing  # noqa: PLC0415
@@ -215,10 +212,10 @@ def read_settings(kind: type, what: str, pairs: Sequence[str]) -> dict[str, Any]
 
 
 def read_weights(pairs: Sequence[str]) -> dict[str, float]:
-    """Read `NAME=VALUE` pairs as cost weights.
+    """Parse `NAME=VALUE` pairs as cost weights.
 
     Raises:
-        UnknownName: If there is no such weight, listing those that there are.
+        UnknownName: If there is no such weight, listing the known ones.
         BadValue: If a pair is malformed or a value out of its range.
     """
     from xop_lerobot.retarget.changes import check_weight  # noqa: PLC0415 MuJoCo

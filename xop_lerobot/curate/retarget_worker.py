@@ -1,8 +1,7 @@
-"""One worker of `xop-curate retarget`: a robot that is driven by recorded operators.
+"""Worker of `xop-curate retarget`: a robot driven by recorded operators.
 
-Everything but the operator is as in `xop-collect`: the LeRobot devices of robot and teleoperator
-in lock-step, one dataset for each episode, and a seed made of the session's and the episode's
-index.
+Everything but the operator is as in `xop-collect`: LeRobot devices of robot and teleoperator in
+lock-step, one dataset per episode, seeded by session and episode index.
 """
 
 from __future__ import annotations
@@ -29,25 +28,25 @@ if TYPE_CHECKING:
     from xop_lerobot.recording.dataset import XopDataset
 
 _GRACE_S = 5.0
-"""How long a robot may take to settle before the operator begins [s]."""
+"""Time for the robot to settle before the operator starts [s]."""
 
 
 _OPERATORS: dict[int, Recording] = {}
-"""The operator that is to be played, by episode; where the worker and its device meet."""
+"""Operator to replay, by episode: passes it from the worker to its device."""
 
 
 class RetargetDevice(ReplayDevice):
-    """Plays in each episode the operator of that very episode of the source.
+    """Plays the operator of the source episode with the same index.
 
     Args:
-        config: Its settings; `path` is the source's name alone.
+        config: Device settings; `path` is only the source's name.
     """
 
     def connect(self) -> None:
-        """Do nothing: the recordings have been read and checked."""
+        """Do nothing: the recordings are already read and checked."""
 
     def begin_episode(self, index: int) -> None:
-        """Take the operator of episode `index`."""
+        """Select the operator of episode `index`."""
         self._recording = _OPERATORS.get(index)
 
 
@@ -57,11 +56,11 @@ DEVICES.add(DEVICE, RetargetDevice)
 class Replayer(Collector):
     """Replays single operators, in any order.
 
-    One that cannot be replayed makes an attempt without frames, which is tried again each time.
+    One that cannot be replayed yields an attempt without frames, repeated in every run.
 
     Args:
-        config: What they are replayed with.
-        run: When this run began [s since the epoch].
+        config: Configuration of the replay.
+        run: Start of this run [s since the epoch].
     """
 
     config: RetargetConfig
@@ -82,19 +81,19 @@ class Replayer(Collector):
         return Attempt(job.index, False, fault, False, 0, run=self.run, elapsed=elapsed, cpu_s=0.0)
 
     def begin(self, job: RetargetJob, teleop: Xop, dataset: XopDataset) -> None:
-        """Put the weights into force, and note where the episode comes from."""
+        """Apply the weights, and set the provenance of the episode."""
         if self.config.weights:
             teleop.change({"weights": dict(self.config.weights)}, source="retarget")
         dataset.more_facts = job.facts
 
     def get_limit(self, job: RetargetJob) -> int:
-        """Frames after which an episode is ended even if the operator could never engage."""
+        """Frames after which an episode ends even if the operator never engaged."""
         assert job.recording is not None
         duration = job.recording.duration + self.config.hold_s + _GRACE_S
         return count_ticks(duration, self.config.fps)
 
     def get_instruction(self, job: RetargetJob, frame: int) -> str:
-        """The task in words that the source has at that time."""
+        """Task description of the source at this frame."""
         stamps = [stamp for stamp, _ in job.tasks]
         last = np.searchsorted(stamps, frame / self.config.fps + 1e-9, side="right") - 1
         return job.tasks[max(int(last), 0)][1]

@@ -1,4 +1,4 @@
-"""The data files of a new dataset: rows as LeRobot writes them, a row group for each episode."""
+"""Data files of a new dataset: rows as LeRobot writes them, one row group per episode."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from xop_lerobot.core.errors import BadDataset
 
 
 class RowFiles:
-    """Writes episodes' rows.
+    """Writes rows of episodes.
 
-    Episodes that come from one file, one after another, go to one file again.
+    Consecutive episodes from one source file share a file.
 
     Args:
         root: Directory of the new dataset.
         template: `data_path` of its `meta/info.json`.
-        chunks_size: How many files go into a directory.
-        features: Its features.
+        chunks_size: Number of files per directory.
+        features: Features of the dataset.
     """
 
     def __init__(
@@ -43,15 +43,15 @@ class RowFiles:
         """Write the rows of an episode.
 
         Args:
-            table: Its rows as they were.
-            columns: Columns that are new or different. Shapes (n, size) or (n,).
-            origin: Which file they come from.
+            table: Source rows.
+            columns: New or changed columns. Shapes (n, size) or (n,).
+            origin: Source file.
 
         Returns:
-            Chunk and file that they are in.
+            Chunk index and file index.
 
         Raises:
-            BadDataset: If a column is missing, or is not what the features say.
+            BadDataset: If a column is missing or does not match the features.
         """
         rows = make_rows(table, columns, self._schema, origin)
         if self._writer is None or origin != self._origin:
@@ -72,7 +72,7 @@ class RowFiles:
         self._origin = origin
 
     def close(self) -> None:
-        """Finish the file; may be called twice."""
+        """Close the file; may be called twice."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
@@ -89,10 +89,10 @@ def make_schema(features: Mapping[str, Any]) -> pa.Schema:
 def make_rows(
     table: pa.Table, columns: Mapping[str, np.ndarray], schema: pa.Schema, origin: object
 ) -> pa.Table:
-    """Make rows as LeRobot writes them; arguments as in `RowFiles.write`.
+    """Convert rows to the schema that LeRobot writes; arguments as in `RowFiles.write`.
 
     Raises:
-        BadDataset: If a column is missing, is not what the features say, or has empty values.
+        BadDataset: If a column is missing, does not match the features, or has nulls.
     """
     arrays = []
     for field in schema:
@@ -108,14 +108,14 @@ def make_rows(
             ) from error
         if count_empty(array):
             raise BadDataset(
-                origin, f"its column '{field.name}' has {count_empty(array)} empty values"
+                origin, f"its column '{field.name}' has {count_empty(array)} null values"
             )
         arrays.append(array)
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def count_empty(array: pa.Array) -> int:
-    """Count the empty values of a column, and those in its lists."""
+    """Count the nulls of a column, including those inside its lists."""
     inner = 0
     if pa.types.is_fixed_size_list(array.type) and not array.null_count:
         inner = array.flatten().null_count
@@ -123,13 +123,13 @@ def count_empty(array: pa.Array) -> int:
 
 
 def next_place(place: tuple[int, int], chunks_size: int) -> tuple[int, int]:
-    """Return the chunk and file after `place`; the first after (0, -1)."""
+    """Return the chunk and file index after `place`; the first after (0, -1)."""
     chunk, file = place
     return (chunk, 0) if file < 0 else update_chunk_file_indices(chunk, file, chunks_size)
 
 
 def to_arrow(values: np.ndarray, kind: pa.DataType) -> pa.Array:
-    """Turn an array into a column of the type `kind`, a list a row if that is one."""
+    """Convert an array to a column of type `kind`, a list per row for list types."""
     flat = pa.array(np.ascontiguousarray(values).reshape(-1))
     if pa.types.is_fixed_size_list(kind):
         return pa.FixedSizeListArray.from_arrays(flat.cast(kind.value_type), type=kind)
@@ -137,7 +137,7 @@ def to_arrow(values: np.ndarray, kind: pa.DataType) -> pa.Array:
 
 
 def cast_column(column: pa.ChunkedArray, kind: pa.DataType) -> pa.Array:
-    """Bring a column to the type `kind`, which other tools may have written in another way."""
+    """Cast a column to type `kind`, in which other tools may not have written it."""
     values = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
     if isinstance(values, pa.ExtensionArray):
         values = values.storage

@@ -1,4 +1,4 @@
-"""A LeRobot v3 dataset, read as a stream; nothing is ever written into its directory."""
+"""Streaming reader of a LeRobot v3 dataset; it never writes into the dataset's directory."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ INDEX = "episode_index"
 
 
 class RowReader:
-    """Reads episodes' rows; the file and the row group that were read last stay open.
+    """Reads rows of episodes; the file and row group read last stay open.
 
-    LeRobot writes a row group for each episode. Where another tool put several into one, they are
-    decoded once for all that are read one after another.
+    LeRobot writes one row group per episode. Where another tool put several episodes into one, it
+    is decoded once for consecutive reads.
 
     Args:
         root: Directory of the dataset.
@@ -49,7 +49,7 @@ class RowReader:
         self._cached: tuple[object, pa.Table] | None = None
 
     def close(self) -> None:
-        """Close the file that is open; may be called at any time."""
+        """Close the open file; may be called at any time."""
         if self._file is not None:
             self._file.close()
         self._file, self._path, self._cached = None, Path(), None
@@ -58,21 +58,21 @@ class RowReader:
         """Read columns of an episode.
 
         Returns:
-            An array for each column, a row for each frame. Shape (n, size), of strings (n, 1).
+            An array per column, one row per frame. Shape (n, size), of strings (n, 1).
 
         Raises:
-            BadDataset: If the file is not readable, has not these columns or has them in another
-                shape, or if it does not hold the whole episode.
+            BadDataset: If the file is not readable, lacks a column or has it in another shape, or
+                does not hold the whole episode.
         """
         names = tuple(dict.fromkeys(columns))
         table = self.read_table(entry, names)
         return {name: self._convert(entry, name, table[name]) for name in names}
 
     def check(self, entry: EpisodeEntry) -> None:
-        """Check that all columns of an episode's file are as announced, without reading them.
+        """Check that the columns of an episode's file match the features, without reading rows.
 
         Raises:
-            BadDataset: If the file is not readable, or one is not.
+            BadDataset: If the file is not readable, or a column does not match.
         """
         if not entry.has_rows:
             raise BadDataset(self._root, entry.faults[0])
@@ -84,11 +84,11 @@ class RowReader:
             raise BadDataset(self._root, f"{entry.file} {'; it '.join(self._faults)}")
 
     def read_table(self, entry: EpisodeEntry, names: Sequence[str] = ()) -> pa.Table:
-        """Read columns of an episode as its file has them; all of its features without `names`.
+        """Read columns of an episode as stored; all columns of features without `names`.
 
         Raises:
-            BadDataset: If the file is not readable, has not these columns, or does not hold the
-                whole episode.
+            BadDataset: If the file is not readable, lacks a column, or does not hold the whole
+                episode.
         """
         if not entry.has_rows:
             raise BadDataset(self._root, entry.faults[0])
@@ -118,7 +118,7 @@ class RowReader:
         missing = [name for name in (INDEX, *names) if name not in present]
         if missing:
             raise BadDataset(
-                self._root, f"{entry.file} has no column {', '.join(missing)}, which it should have"
+                self._root, f"{entry.file} lacks the column {', '.join(missing)} of the features"
             )
         parts = []
         for group, span in enumerate(self._groups):
@@ -138,7 +138,7 @@ class RowReader:
     def _read_group(self, file: pq.ParquetFile, group: int, names: Sequence[str]) -> pa.Table:
         key = (group, names)
         if self._cached is None or self._cached[0] != key:
-            self._cached = None  # so that two groups are never in memory
+            self._cached = None  # free the last group first: two may not fit into memory
             wanted = list(dict.fromkeys((INDEX, *names)))
             self._cached = (key, file.read_row_group(group, columns=wanted, use_threads=False))
         return self._cached[1]
@@ -148,9 +148,9 @@ class RowReader:
         size = int(np.prod(feature["shape"]))
         where = f"column '{name}' of episode {entry.index}"
         if _holds_pictures(column.type):
-            raise BadDataset(self._root, f"{where} holds pictures and no numbers")
+            raise BadDataset(self._root, f"{where} holds images, not numbers")
         values, rows = column.combine_chunks(), len(column)
-        if isinstance(values, pa.ChunkedArray):  # as some versions of pyarrow have it
+        if isinstance(values, pa.ChunkedArray):  # some versions of pyarrow return chunks
             values = pa.concat_arrays(values.chunks) if values.num_chunks else pa.array([])
         while pa.types.is_nested(values.type) and not values.null_count:
             sizes = values.value_lengths().unique().to_pylist()
@@ -162,7 +162,7 @@ class RowReader:
                 )
             values = values.flatten()
         if values.null_count:
-            raise BadDataset(self._root, f"{where} has {values.null_count} empty values")
+            raise BadDataset(self._root, f"{where} has {values.null_count} null values")
         if len(values) != rows * size:
             actual = f"{len(values) / rows:g}" if rows else "no"
             raise BadDataset(self._root, f"{where} must have {size} entries a row, it has {actual}")
@@ -184,7 +184,7 @@ def _holds_pictures(kind: pa.DataType) -> bool:
 
 
 def _find_groups(file: pq.ParquetFile) -> list[tuple[int, int] | None]:
-    """Find the lowest and the highest episode of each row group; None where it is not stated."""
+    """Find the lowest and highest episode index of each row group; None if not stated."""
     metadata = file.metadata
     spans: list[tuple[int, int] | None] = []
     names = file.schema_arrow.names
@@ -209,10 +209,10 @@ _NUMBERS = (int, float)
 
 
 class Source:
-    """A dataset that is read: its features, its episodes, and their rows.
+    """A dataset opened for reading: features, episodes and rows.
 
-    Memory does not grow with the dataset: of the metadata a few episodes are held at a time, of
-    the rows one row group, which in LeRobot's files is one episode.
+    Memory does not grow with the dataset: only the metadata of a few episodes and one row group,
+    which in LeRobot's files is one episode, are held at a time.
 
     Args:
         root: Directory of the dataset.
@@ -221,8 +221,8 @@ class Source:
         root: The same.
         info: Content of `meta/info.json`.
         features: Features by key: dtype, shape and names.
-        fps: Frames a second [Hz].
-        robot: LeRobot's robot type; None if it is not stated.
+        fps: Frame rate [Hz].
+        robot: LeRobot's robot type; None if not stated.
 
     Raises:
         BadDataset: If there is no LeRobot v3 dataset, or its `meta/info.json` is malformed.
@@ -248,17 +248,17 @@ class Source:
         self.close()
 
     def close(self) -> None:
-        """Close the file that was read last."""
+        """Close the open file."""
         self._rows.close()
 
     @property
     def total_episodes(self) -> int:
-        """How many episodes the dataset says that it has."""
+        """Number of episodes that `meta/info.json` states."""
         return int(self.info.get("total_episodes") or 0)
 
     @property
     def episodes(self) -> Iterator[EpisodeEntry]:
-        """The episodes in order.
+        """Iterate over the episodes in order.
 
         Raises:
             BadDataset: If the metadata is missing or malformed.
@@ -266,7 +266,10 @@ class Source:
         return self.iterate()
 
     def iterate(self, note: Callable[[str], None] | None = None) -> Iterator[EpisodeEntry]:
-        """The episodes in order; `note` is told of files that cannot be read, instead of an error.
+        """Iterate over the episodes in order.
+
+        Args:
+            note: Receives unreadable files and invalid rows of metadata; None makes them errors.
 
         Raises:
             BadDataset: If the metadata is missing or malformed.
@@ -275,35 +278,35 @@ class Source:
 
     @cached_property
     def video_use(self) -> VideoUse:
-        """Which videos belong to episodes, and which pictures to more than one.
+        """Videos that episodes use, and images that several episodes claim.
 
         Raises:
-            BadDataset: If the pattern of the paths is malformed.
+            BadDataset: If the path pattern is malformed.
         """
         return find_video_use(self.root, self.info)
 
     def read(self, entry: EpisodeEntry, columns: Iterable[str]) -> dict[str, np.ndarray]:
-        """Read columns of an episode, and nothing else.
+        """Read only these columns of an episode.
 
         Args:
             entry: The episode.
-            columns: Keys of features; pictures cannot be read so.
+            columns: Keys of features other than images.
 
         Returns:
-            An array for each column, with a row for each frame, of the file's dtype and always
-            of two dimensions; it may be read-only. Shape (n, size).
+            An array per column, one row per frame, of the file's dtype, possibly read-only. Shape
+            (n, size).
 
         Raises:
-            BadDataset: If the dataset has not these columns, or the file is malformed.
+            BadDataset: If the dataset lacks a column, or the file is malformed.
         """
         wanted = tuple(columns)
         self.check(wanted)
         return self._rows.read(entry, wanted)
 
     def read_table(self, entry: EpisodeEntry, columns: Sequence[str] = ()) -> pa.Table:
-        """Read columns of an episode as they are in its file, all without `columns`.
+        """Read columns of an episode as stored, images included; all without `columns`.
 
-        Pictures can be read so.
+        Images can be read so.
 
         Raises:
             BadDataset: If the file is malformed, or does not hold the whole episode.
@@ -311,10 +314,10 @@ class Source:
         return self._rows.read_table(entry, columns)
 
     def check_rows(self, entry: EpisodeEntry) -> None:
-        """Check that the columns of an episode's file are as announced, without reading them.
+        """Check that an episode's file matches the features, without reading rows.
 
         Raises:
-            BadDataset: If the file is not readable, or one is not.
+            BadDataset: If the file is not readable, or a column does not match.
         """
         self._rows.check(entry)
 
@@ -322,7 +325,7 @@ class Source:
         """Check that the dataset has these columns.
 
         Raises:
-            BadDataset: If not, listing those that it has.
+            BadDataset: If it lacks one, listing those that it has.
         """
         missing = [name for name in columns if name not in self.features]
         if missing:
@@ -333,7 +336,7 @@ class Source:
             )
 
     def read_config(self) -> dict[str, Any]:
-        """Read `meta/xop/config.json`; empty where there is none or it is no JSON object."""
+        """Read `meta/xop/config.json`; empty if missing or no JSON object."""
         try:
             config = json.loads((self.root / CONFIG_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -348,7 +351,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     try:
         info = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise BadDataset(root, f"it has no {INFO_FILE}, so it is no LeRobot dataset") from None
+        raise BadDataset(root, f"it has no {INFO_FILE}, so it is not a LeRobot dataset") from None
     except (OSError, ValueError) as error:
         raise BadDataset(root, f"{INFO_FILE} is not readable ({error})") from error
     if not isinstance(info, dict):
@@ -357,8 +360,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     if not version.startswith(VERSION):
         raise BadDataset(
             root,
-            f"it must be of LeRobot's version v3.0, it is of {version}. "
-            f"`{_CONVERT}` converts from v2.1",
+            f"its format must be LeRobot's v3.0, it is {version}. `{_CONVERT}` converts from v2.1",
         )
     fps = info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, _NUMBERS) or not 0 < fps < math.inf:

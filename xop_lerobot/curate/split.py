@@ -3,9 +3,9 @@
     xop-curate split --root outputs/boxes --out outputs/parts --parts train=0.8 val=0.2
     xop-curate split --root outputs/boxes --out outputs/parts --parts a=0:10 b=12,15,20:30
 
-Each part is a dataset in a directory of its own, `OUT/NAME`. Fractions are taken in the order of
-the episodes, as by LeRobot's own split, or at random with `--shuffle SEED`. The facts on every
-episode come along, and no picture is encoded anew.
+Each part is a dataset in its own directory, `OUT/NAME`. Fractions are taken in the order of the
+episodes, as by LeRobot's own split, or at random with `--shuffle SEED`. The metadata of every
+episode is kept, and no image is re-encoded.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def add_arguments(parser: CommandParser) -> None:
         "--shuffle",
         type=int,
         metavar="SEED",
-        help="draw the episodes of fractions at random (default: in their order)",
+        help="draw the episodes of fractions at random (default: in order)",
     )
 
 
@@ -91,10 +91,10 @@ def _make_clips(source: Source, chosen: Sequence[int], *, quiet: bool) -> Iterat
 
 
 def parse_parts(texts: Sequence[str]) -> dict[str, float | list[int]]:
-    """Read what `--parts` asks for: a fraction, or episodes, by the part's name.
+    """Parse `--parts`: a fraction or a list of episodes by part name.
 
     Raises:
-        BadValue: If it is malformed, mixes both, or fractions exceed 1.
+        BadValue: If it is malformed, mixes fractions and lists, or the fractions exceed 1.
     """
     parts: dict[str, float | list[int]] = {}
     for text in texts:
@@ -128,7 +128,7 @@ def _parse_share(text: str, share: str) -> float | list[int]:
 
 
 def format_indices(indices: Sequence[int]) -> str:
-    """Write a list of indices in ascending order as `0, 3, 10:20`."""
+    """Format ascending indices as `0, 3, 10:20`."""
     pieces: list[list[int]] = []
     for index in sorted(indices):
         if pieces and index == pieces[-1][1]:
@@ -146,12 +146,12 @@ def assign(
     """Assign episodes to parts.
 
     Args:
-        shares: What `parse_parts` has read.
-        indices: The episodes that there are.
-        seed: Seed of the draw, None to take them in their order.
+        shares: Result of `parse_parts`.
+        indices: Indices of the existing episodes.
+        seed: Seed of the random draw, None to keep the order.
 
     Raises:
-        BadValue: If there is no such episode, one is in two parts, or a part stays empty.
+        BadValue: If an episode does not exist or is in two parts, or a part is empty.
     """
     order = list(indices)
     if seed is not None:

@@ -1,4 +1,4 @@
-"""Statistics of episodes: taken over where nothing has changed, and computed as LeRobot does."""
+"""Statistics of episodes: reused where values are unchanged, else computed as LeRobot does."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ type Stats = dict[str, dict[str, np.ndarray]]
 
 
 class StatsReader:
-    """Reads the statistics of a dataset's episodes from its metadata, best in their order.
+    """Reads episode statistics from a dataset's metadata, fastest in ascending order.
 
-    Only a few episodes are in memory at a time. Going back begins with the first file again.
+    Only a few episodes are in memory at a time. Reading an earlier episode restarts from the first
+    file.
 
     Args:
         root: Directory of the dataset.
@@ -41,11 +42,11 @@ class StatsReader:
         self._ahead: dict[int, dict[str, Any]] = {}
 
     def read(self, episode: int) -> Stats:
-        """Read the statistics of `episode`; empty where there are none."""
+        """Read the statistics of `episode`; empty if there are none."""
         for _ in range(2):
             for row in self._take(episode):
                 return _parse(row)
-            self._rows = self._iterate()  # it may lie before
+            self._rows = self._iterate()  # the episode may precede the reading position
         return {}
 
     def _take(self, episode: int) -> Iterator[dict[str, Any]]:
@@ -81,7 +82,7 @@ def _parse(row: Any) -> Stats:
 
 
 def compute_stats(columns: Mapping[str, np.ndarray], features: Mapping[str, Any]) -> Stats:
-    """Compute the statistics of columns of numbers, as LeRobot does when it records.
+    """Compute the statistics of numeric columns, as LeRobot does when it records.
 
     Args:
         columns: Values by key. Shapes (n, size); size 1 may be (n,).
@@ -96,10 +97,10 @@ def compute_stats(columns: Mapping[str, np.ndarray], features: Mapping[str, Any]
 
 
 def compute_picture_stats(pictures: Iterator[np.ndarray]) -> dict[str, np.ndarray]:
-    """Compute the statistics of pictures by channel, from 0 to 1, as LeRobot does.
+    """Compute per-channel statistics of images, scaled to 0 to 1, as LeRobot does.
 
     Args:
-        pictures: Those that `pick_pictures` names. Shapes (height, width, 3), uint8.
+        pictures: The images that `pick_pictures` chose. Shapes (height, width, 3), uint8.
     """
     stack = np.stack(
         [auto_downsample_height_width(picture.transpose(2, 0, 1)) for picture in pictures]
@@ -112,12 +113,12 @@ def compute_picture_stats(pictures: Iterator[np.ndarray]) -> dict[str, np.ndarra
 
 
 def pick_pictures(length: int) -> list[int]:
-    """Pick the pictures of an episode of `length` frames that its statistics are made of."""
+    """Choose the frames of an episode of `length` that its image statistics use."""
     return sorted(set(sample_indices(length)))
 
 
 def read_pictures(column: pa.ChunkedArray, numbers: list[int]) -> Iterator[np.ndarray]:
-    """Decode pictures that are in the rows. Shapes (height, width, 3), uint8."""
+    """Decode images stored in the rows. Shapes (height, width, 3), uint8."""
     for number in numbers:
         data = column[number].as_py()["bytes"]
         yield np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))

@@ -1,4 +1,4 @@
-"""Sub-tasks: a column of numbers, and a table that names them, as LeRobot had them until 0.5."""
+"""Sub-tasks: a column of indices and a table of their names, as in LeRobot up to 0.5."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NAME = "subtask"
 
 
 def read_subtasks(root: Path) -> dict[int, str]:
-    """Read the names of sub-tasks by number; empty where there are none.
+    """Read the names of sub-tasks by index; empty if the dataset has none.
 
     Raises:
         BadDataset: If the file is malformed.
@@ -32,7 +32,7 @@ def read_subtasks(root: Path) -> dict[int, str]:
 
 
 def write_subtasks(root: Path, names: Sequence[str]) -> None:
-    """Write the names of sub-tasks, numbered from 0."""
+    """Write the names of sub-tasks, indexed from 0."""
     import pandas as pd  # noqa: PLC0415 slow
 
     table = pd.DataFrame({SUBTASK: range(len(names))}, index=pd.Index(names, name=_NAME))

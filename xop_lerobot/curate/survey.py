@@ -1,4 +1,4 @@
-"""Goes through a dataset and tells the figures of each episode, one episode at a time."""
+"""Computes the metrics of each episode of a dataset, one episode at a time."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from xop_lerobot.curate.source import EpisodeEntry, Source
 from xop_lerobot.curate.video import VideoIndex, index_video
 
 _HEAD = 8
-"""Bytes of the size and the name of a box."""
+"""Size of an MP4 box header: length and type [bytes]."""
 _SLACK = 0.5
-"""Frames by which a video may end early without a picture being missed: half of one."""
+"""Tolerance for the end of a video [frames]: below half a frame no image is missing."""
 
 
 class VideoCheck:
-    """Looks at videos' heads and packets, without decoding a picture; each file once.
+    """Checks headers and packets of videos without decoding an image, each file once.
 
     Args:
         source: The dataset.
@@ -38,7 +38,7 @@ class VideoCheck:
         self._last: dict[str, tuple[Path, str, float, VideoIndex | None]] = {}
 
     def check(self, entry: EpisodeEntry) -> list[str]:
-        """Say what is wrong with the videos of an episode; empty if nothing is."""
+        """List the faults of an episode's videos; empty if there are none."""
         problems = []
         dt = 1 / self._source.fps
         for key, span in entry.videos.items():
@@ -55,19 +55,19 @@ class VideoCheck:
                 )
             elif abs(frames - entry.length) > _SLACK:
                 problems.append(
-                    f"episode {entry.index} has {entry.length} frames, but {frames:g} pictures of "
+                    f"episode {entry.index} has {entry.length} frames, but {frames:g} images of "
                     f"'{key}'"
                 )
             damaged = index.count_damaged(span.start, span.stop, self._source.fps) if index else 0
             if damaged:
                 problems.append(
-                    f"{span.file} is damaged: {damaged} of the {entry.length} pictures of episode "
+                    f"{span.file} is damaged: {damaged} of the {entry.length} images of episode "
                     f"{entry.index}"
                 )
         return problems
 
     def _look(self, file: Path) -> tuple[str, float, VideoIndex | None]:
-        """What is wrong with a file, when its pictures end [s], and its packets."""
+        """Return a file's fault, the end time of its images [s], and its packet index."""
         fault, end = probe(self._source.root / file)
         if fault:
             return fault, end, None
@@ -78,7 +78,7 @@ class VideoCheck:
 
 
 def probe(path: Path) -> tuple[str, float]:
-    """Return what is wrong with a video, empty if nothing, and when its pictures end [s]."""
+    """Return the fault of a video, empty if none, and the end time of its images [s]."""
     if not path.is_file():
         return "there is no such file", 0.0
     try:
@@ -94,20 +94,20 @@ def probe(path: Path) -> tuple[str, float]:
 
 
 def _find_end(stream: av.VideoStream) -> float:
-    """Find when the last picture of a stream ends [s]."""
+    """Return the end time of a stream's last image [s]."""
     if stream.duration and stream.time_base:
         return float((stream.duration + (stream.start_time or 0)) * stream.time_base)
     return stream.frames / float(stream.average_rate or 1)
 
 
 def _is_cut_off(path: Path) -> bool:
-    """Whether the last of the boxes that an MP4 file consists of reaches beyond its end."""
+    """Whether the last box of an MP4 file extends beyond the end of the file."""
     size, place = path.stat().st_size, 0
     with path.open("rb") as file:
         while place + _HEAD <= size:
             file.seek(place)
             length, kind, long = struct.unpack(">I4sQ", file.read(2 * _HEAD).ljust(2 * _HEAD))
-            if not kind.isalnum():  # no MP4: whether it is a video at all is for FFmpeg to say
+            if not kind.isalnum():  # not an MP4 file; FFmpeg decides whether it is a video
                 return False
             length = {0: size - place, 1: long}.get(length, length)
             place += max(length, _HEAD)
@@ -121,18 +121,17 @@ _FACTS = {
         "start_time", "collision",
     )
 }  # fmt: skip
-"""Figures that are facts, and the facts that they are."""
+"""Metrics taken from the episode metadata, and their keys there."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What is known of an episode.
+    """Metrics of an episode.
 
     Attributes:
-        entry: What the metadata says.
-        figures: The figures that were asked for by name, in the order of `FIGURES`; None for what
-            is not known.
-        problems: What could not be read, or is not as the metadata says.
+        entry: The episode's metadata.
+        figures: The requested metrics by name, in the order of `FIGURES`; None if missing.
+        problems: What could not be read, or contradicts the metadata.
     """
 
     entry: EpisodeEntry
@@ -140,7 +139,7 @@ class Finding:
     problems: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures and the problems as plain values."""
+        """Return metrics and problems as plain values."""
         return {**self.figures, "problems": list(self.problems)}
 
 
@@ -150,14 +149,14 @@ def survey(
     note: Callable[[str], None] | None = None,
     episodes: Collection[int] | None = None,
 ) -> Iterator[Finding]:
-    """Find the figures of each episode in order; what is not asked for is not read.
+    """Compute metrics of each episode in order, reading only what they need.
 
-    Rows that cannot be read are no error: the figures of them are None, and `problems` says why.
+    Unreadable rows are no error: their metrics are None, and `problems` says why.
 
     Args:
         source: The dataset.
-        names: Names of the figures.
-        note: Told of files of metadata that cannot be read; None makes them an error.
+        names: Names of the metrics.
+        note: Receives unreadable files of metadata; None makes them errors.
         episodes: Indices of the episodes; all if None.
 
     Raises:
@@ -207,10 +206,10 @@ def _measure(
     problems: list[str],
     more: tuple[str, ...] | None,
 ) -> tuple[dict[str, Any], Mapping[str, np.ndarray] | None]:
-    """Compute figures; `more` are columns to be read too, of rows that are to be checked.
+    """Compute metrics, and read further columns `more` for checks.
 
     Returns:
-        The figures, and the columns; None if one of them cannot be read.
+        The metrics, and the columns; None if a column cannot be read.
     """
     columns = {each: each.find_columns(source.features, entry) for each in measures}
     able = {each: names for each, names in columns.items() if names is not None}
@@ -230,7 +229,7 @@ def _measure(
     values: dict[str, Any] = {}
     for measure, names in able.items():
         try:
-            # If one column is bad, the figures of the others are found all the same.
+            # If a column is unreadable, metrics that do not need it are still computed.
             held = source.read(entry, names) if rows is None and names else rows or {}
             values |= _compute(source, entry, measure, {name: held[name] for name in names})
         except BadDataset as error:
@@ -245,12 +244,12 @@ def _compute(
 ) -> Mapping[str, Any]:
     robot = entry.facts.get("robot", source.robot)
     robot = robot if isinstance(robot, str) else None
-    with np.errstate(all="ignore"):  # what is not finite is not known, see `_clean`
+    with np.errstate(all="ignore"):  # `_clean` turns non-finite values into None
         return measure.compute(Episode(entry, source.features, rows, 1 / source.fps, robot))
 
 
 def _clean(value: Any, name: str, problems: list[str]) -> Any:
-    """Return `value` if it is of the figure's kind and finite, else None."""
+    """Return `value` if it is finite and of the metric's type, else None."""
     if value is None:
         return None
     kind = KINDS[name]

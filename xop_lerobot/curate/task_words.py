@@ -1,4 +1,4 @@
-"""The tasks of a dataset in words, by the number that its rows give."""
+"""Task descriptions of a dataset by task index."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from xop_lerobot.curate.entries import UNREADABLE
 TASK = "task_index"
 TASKS_FILE = Path("meta") / "tasks.parquet"
 _WORDS = ("task", "__index_level_0__")
-"""Columns of the words: LeRobot's, and what pandas calls an index without a name."""
+"""Columns that hold the description: LeRobot's, and the one pandas writes for an unnamed index."""
 
 
 def read_tasks(root: Path) -> dict[int, str]:
-    """Read the words of each task by its number.
+    """Read the description of each task by its index.
 
-    LeRobot keeps the words in the index of a pandas table, other writers in a column like any
-    other. In the file both are a column of text, so it is read without pandas, which would take
-    the row's number for the words of the second kind.
+    LeRobot stores descriptions in the index of a pandas table, other writers in an ordinary column.
+    Both are text columns of the file. It is read without pandas, which would take the row number
+    for the description in the second case.
 
     Raises:
-        BadDataset: If the file is malformed, or does not say which column holds the words.
+        BadDataset: If the file is malformed, or it is unclear which column holds the descriptions.
     """
     try:
         table = pq.read_table(root / TASKS_FILE)
@@ -36,7 +36,7 @@ def read_tasks(root: Path) -> dict[int, str]:
     if name is None:
         raise BadDataset(
             root,
-            f"{TASKS_FILE} must have one column of text, the words of the tasks, beside {TASK}. "
+            f"{TASKS_FILE} must have one text column, the task descriptions, beside {TASK}. "
             f"Its columns: {', '.join(table.column_names)}",
         )
     tasks: dict[int, str] = {}
@@ -53,7 +53,7 @@ def read_tasks(root: Path) -> dict[int, str]:
 
 
 def find_words(schema: pa.Schema) -> str | None:
-    """Find the column that holds the words; None if there is none, or more than one may."""
+    """Return the column of descriptions; None if there is none or several candidates."""
     texts = [field.name for field in schema if _is_text(field.type)]
     named = [name for name in _WORDS if name in texts]
     if named:
@@ -62,7 +62,7 @@ def find_words(schema: pa.Schema) -> str | None:
 
 
 def has_index_of_words(root: Path) -> bool:
-    """Whether LeRobot finds the words, which it takes from the index of the pandas table."""
+    """Whether the descriptions are the index of the pandas table, where LeRobot looks."""
     schema = pq.read_schema(root / TASKS_FILE)
     return find_words(schema) in (schema.pandas_metadata or {}).get("index_columns", ())
 

@@ -1,8 +1,8 @@
-"""Write a choice of episodes, whole or cut, as a new LeRobot dataset.
+"""Write selected episodes, complete or trimmed, as a new LeRobot dataset.
 
-LeRobot's own `delete_episodes` and `split_dataset` encode a video anew when one of its episodes
-goes, hold the whole dataset, and drop what they do not know: this project's facts. Here rows and
-pictures stream from file to file, one episode at a time, and LeRobot's metadata class writes
+LeRobot's own `delete_episodes` and `split_dataset` re-encode a video when one of its episodes
+is removed, hold the whole dataset in memory, and drop this project's metadata. Here rows and
+images stream from file to file, one episode at a time, and LeRobot's metadata class writes
 everything in `meta` that is LeRobot's own.
 """
 
@@ -57,7 +57,7 @@ _SIZES = ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb")
 
 
 class NothingLeft(XopError):
-    """Not a single episode is to be written."""
+    """Raised when no episode is to be written."""
 
     def __init__(self) -> None:
         super().__init__("no episode is left, so no dataset is made")
@@ -65,11 +65,11 @@ class NothingLeft(XopError):
 
 @dataclass(frozen=True)
 class Transferred:
-    """What was written.
+    """Size of the written dataset.
 
     Attributes:
-        episodes: Episodes.
-        frames: Frames of all of them.
+        episodes: Number of episodes.
+        frames: Number of frames.
     """
 
     episodes: int
@@ -82,19 +82,19 @@ def transfer(
     step: Step,
     features: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Transferred:
-    """Write clips as a new dataset, in their order.
+    """Write clips in order as a new dataset.
 
-    Every column, picture and fact comes along. Frames, episodes and time stamps are counted anew;
-    statistics are computed anew where values have changed. Memory holds one episode.
+    Every column, image and metadata entry is kept. Frames, episodes and time stamps are renumbered;
+    statistics are recomputed where values have changed. Memory holds one episode.
 
     Args:
-        clips: What is written; all of datasets with the same features.
+        clips: Clips to write; their datasets must have the same features.
         draft: Directory of the new dataset, which must not exist.
-        step: What is being done, for the episodes' `provenance`.
-        features: Features of columns that are new.
+        step: The present step, for the `provenance` of the episodes.
+        features: Features of new columns.
 
     Raises:
-        NothingLeft: If there are no clips; nothing is written then.
+        NothingLeft: If there are no clips; nothing is written.
         BadDataset: If a source is malformed.
     """
     writer: _Writer | None = None
@@ -115,10 +115,10 @@ class _Writer:
     """Writes one dataset.
 
     Args:
-        root: Its directory.
-        first: The first clip, whose source says what the dataset is like.
-        step: What is being done.
-        features: Features of columns that are new.
+        root: Directory of the dataset.
+        first: The first clip; its source defines features and settings.
+        step: The present step.
+        features: Features of new columns.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class _Writer:
         self._facts = (root / EPISODES_FILE).open("w", encoding="utf-8")
 
     def close(self) -> None:
-        """Finish all files."""
+        """Close all files."""
         if self._subtasks:
             write_subtasks(self._root, self._subtasks)
         for part in (self._rows, *self._videos.values(), self._facts):
@@ -198,7 +198,7 @@ class _Writer:
         return self._sources[root]
 
     def _keep_config(self, root: Path) -> None:
-        """Keep the configuration of a source, that of the first at the usual place too."""
+        """Copy the configurations of a source; the first one also to the usual path."""
         target = self._root / CONFIG_FILE
         for path in (root / CONFIG_FILE, *sorted((root / CONFIGS_DIR).glob("*.json"))):
             try:
@@ -223,10 +223,10 @@ class _Writer:
         }
 
     def _number_subtasks(self, table: pa.Table, names: Mapping[int, str]) -> np.ndarray:
-        """Number the sub-tasks of each row anew, the same everywhere in the new dataset."""
+        """Renumber the sub-tasks of the rows consistently over the new dataset."""
         numbers = table[SUBTASK].to_pylist()
         self._subtasks += [name for name in names.values() if name not in self._subtasks]
-        # A number without a name stays as it is; LeRobot's is -1.
+        # An index without a name is kept; LeRobot uses -1 for none.
         return np.array(
             [self._subtasks.index(names[n]) if n in names else n for n in numbers], np.int64
         )
@@ -239,7 +239,7 @@ class _Writer:
         columns: Mapping[str, np.ndarray],
         cuts: Mapping[str, Cut],
     ) -> Stats:
-        """Take over the statistics of what is as it was, and compute the others."""
+        """Reuse the statistics of unchanged features and compute the others."""
         features = self.meta.features
         known = {} if clip.is_cut else reader.read(clip.entry.index)
         stats = {
@@ -252,7 +252,7 @@ class _Writer:
             if key in stats and key not in columns:
                 continue
             if key in self.meta.depth_keys:
-                # Depth is stored as the encoder quantised it; its statistics stay the episode's.
+                # Depth is stored quantised, so statistics cannot be recomputed: keep the episode's.
                 stats |= {each: value for each, value in reader.read(clip.entry.index).items()
                           if each == key}  # fmt: skip
             elif feature["dtype"] == "video":
@@ -268,7 +268,7 @@ class _Writer:
 
 
 class _SourceParts:
-    """What is read of a source beside its rows."""
+    """What is read of a source besides its rows."""
 
     def __init__(self, root: Path) -> None:
         self.stats = StatsReader(root)
@@ -277,7 +277,7 @@ class _SourceParts:
         self.subtasks = read_subtasks(root)
 
     def name_tasks(self, table: pa.Table, clip: Clip) -> list[str]:
-        """Name the task of each row."""
+        """Return the task description of each row."""
         if clip.task is not None:
             return [clip.task] * table.num_rows
         numbers = table[TASK].to_pylist()
@@ -292,20 +292,20 @@ class _SourceParts:
 
 
 def _cut_videos(clip: Clip, keys: Iterable[str]) -> dict[str, Cut]:
-    """Find where the pictures of a clip are."""
+    """Locate the images of a clip in the videos."""
     (start, stop), fps, cuts = clip.span, clip.source.fps, {}
     dropped = clip.entry.facts.get("dropped_frames")
     spare = dropped if isinstance(dropped, int) else 0
     for key in keys:
         span = clip.entry.videos[key]
         pictures = (span.stop - span.start) * fps
-        if not -0.5 - spare < pictures - clip.entry.length < 0.5:  # half a picture for rounding
+        if not -0.5 - spare < pictures - clip.entry.length < 0.5:  # half an image for rounding
             raise BadDataset(
                 clip.source.root,
                 f"episode {clip.entry.index} has {clip.entry.length} frames, but {pictures:g} "
-                f"pictures of '{key}'",
+                f"images of '{key}'",
             )
-        # The end of the last picture, as the metadata has it: pictures may have been dropped.
+        # The metadata states the end: with dropped images it cannot be counted from the start.
         end = span.stop if stop == clip.entry.length else span.start + stop / fps
         begin = span.start + start / fps
         cuts[key] = Cut(clip.source.root, span.file, begin, end, stop - start, spare)
@@ -322,7 +322,7 @@ def _is_finite(values: np.ndarray) -> bool:
 
 
 def _plain(stats: Stats) -> Stats:
-    """Bring statistics to one type, so that those of all episodes fit into one column."""
+    """Convert statistics to one dtype, so that those of all episodes fit into one column."""
     return {
         key: {
             kind: np.atleast_1d(value).astype(np.int64 if kind == "count" else np.float64)
@@ -333,11 +333,11 @@ def _plain(stats: Stats) -> Stats:
 
 
 def to_metadata(facts: Mapping[str, Any], *, complete: bool) -> dict[str, Any]:
-    """Turn facts into columns of LeRobot's episode metadata.
+    """Convert metadata entries into columns of LeRobot's episode metadata.
 
     Args:
-        facts: What is known of an episode.
-        complete: Whether all columns of `EpisodeFacts` are made, those with nothing known too.
+        facts: Metadata of an episode.
+        complete: Whether to make all columns of `EpisodeFacts`, with defaults for missing entries.
     """
     columns: dict[str, Any] = {}
     defaults = {"bool": False, "int": 0, "float": 0.0, "str": ""}

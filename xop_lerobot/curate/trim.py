@@ -1,9 +1,9 @@
-"""Cut idle starts and ends off every episode, and leave a margin.
+"""Trim idle time at the start and end of every episode, up to a margin.
 
-Idle is a frame in which nobody drives, or around which neither the person nor the robot moves
-(`xop_lerobot.curate.quality.find_idle`). Datasets of other projects have no operator; there it is
-the action that does not move. Rows, pictures, time stamps, statistics and facts are cut to fit; no
-picture is encoded anew. The end is never cut before the last change of `next.success`.
+A frame is idle if nobody is engaged, or if neither operator nor robot moves around it
+(`xop_lerobot.curate.quality.find_idle`). Datasets of other projects have no operator; there the
+action counts. Rows, images, time stamps, statistics and metadata are cut to fit; no image is
+re-encoded. The end is never cut before the last change of `next.success`.
 
     xop-curate trim --root outputs/boxes --out outputs/boxes_trimmed --margin 0.5
 """
@@ -32,7 +32,7 @@ from xop_lerobot.curate.source import EpisodeEntry, Source
 if TYPE_CHECKING:
     from xop_lerobot.curate.clip import Clip
 
-SUMMARY = "cut idle starts and ends"
+SUMMARY = "trim idle starts and ends"
 
 _ENDS = ("start", "end", "both")
 _OUTCOME = ("next.success", "next.done")
@@ -47,18 +47,18 @@ def add_arguments(parser: CommandParser) -> None:
         type=float,
         default=0.5,
         metavar="S",
-        help="idle time that stays at each end [s] (default: 0.5)",
+        help="idle time kept at each end [s] (default: 0.5)",
     )
     parser.add_argument(
         "--limit",
         type=float,
         default=quality.STILL_LIMIT_M,
         metavar="M",
-        help="how far what stands still moves within half a second [m] "
+        help="largest motion within half a second that counts as stationary [m] "
         f"(default: {quality.STILL_LIMIT_M:g})",
     )
     parser.add_argument(
-        "--ends", choices=_ENDS, default="both", help="what is cut: start, end or both (default)"
+        "--ends", choices=_ENDS, default="both", help="ends to trim: start, end or both (default)"
     )
 
 
@@ -90,12 +90,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Trimmer:
-    """Finds what is cut off each episode.
+    """Determines what is trimmed off each episode.
 
     Args:
         source: The dataset.
-        margin: Idle time that stays [s].
-        limit: How far what stands still moves [m].
+        margin: Idle time kept at each end [s].
+        limit: Largest motion of a stationary pose's points [m].
         ends: `start`, `end` or `both`.
     """
 
@@ -111,7 +111,7 @@ class Trimmer:
         self._frames = self._kept = 0
 
     def make_clips(self, *, quiet: bool = True) -> Iterator[Clip]:
-        """Make what stays of each episode."""
+        """Yield the kept part of each episode."""
         from xop_lerobot.curate.clip import Clip  # noqa: PLC0415
 
         source = self._source
@@ -124,7 +124,7 @@ class Trimmer:
                 yield Clip(source, entry, span, columns=self._end_outcome(entry, span))
 
     def find_span(self, entry: EpisodeEntry) -> tuple[int, int]:
-        """Find the first frame that stays, and the one after the last; all if nothing moves."""
+        """Return the first kept frame and the one after the last; all if everything is idle."""
         idle = self._find_idle(entry)
         start, stop = quality.find_active_span(idle)
         if start == stop:
@@ -145,15 +145,15 @@ class Trimmer:
         if columns is None:
             raise BadDataset(
                 source.root,
-                "it has neither poses of an operator nor an action, so nothing tells what is "
-                f"idle. Its columns: {', '.join(sorted(source.features))}",
+                "it has neither operator poses nor an action, so idle time is unknown. "
+                f" Its columns: {', '.join(sorted(source.features))}",
             )
         rows = source.read(entry, columns)
         episode = Episode(entry, source.features, rows, 1 / source.fps, source.robot)
         return find_idle(episode, self._limit)
 
     def _end_outcome(self, entry: EpisodeEntry, span: tuple[int, int]) -> dict[str, np.ndarray]:
-        """Let the last row say what the last row of the whole episode said."""
+        """Copy the outcome of the episode's last row to the last kept row."""
         keys = [key for key in _OUTCOME if key in self._source.features]
         columns = {}
         for key, values in self._source.read(entry, keys).items() if keys else ():
@@ -173,7 +173,7 @@ class Trimmer:
             )
 
     def report(self) -> None:
-        """Print what was cut."""
+        """Print what was trimmed."""
         for line in self._lines:
             print(line)
         cut, whole = ((n / self._source.fps) for n in (self._frames - self._kept, self._frames))

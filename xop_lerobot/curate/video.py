@@ -1,15 +1,15 @@
-"""Pictures of episodes, taken from video files as they are: nothing is encoded anew.
+"""Cut and copy videos of episodes without re-encoding.
 
-A video can be cut only before a picture that is complete in itself (a key frame), but an episode
-of LeRobot's may begin anywhere in its file: its metadata says at which time. So a cut keeps the
-whole groups of pictures that the episode needs, and the times are exact. With LeRobot's own setting
-(a key frame every second picture) a single picture too much stays at each end.
+A video can be cut only before a key frame, but an episode of LeRobot's may start anywhere in its
+file: its metadata states the time. So a cut keeps the whole groups of pictures (GOPs) that the
+episode needs, and the times stay exact. With LeRobot's encoder settings (every second image is a
+key frame) at most one superfluous image remains at each end.
 
-Whether the packets of a video are whole is told by their framing, without decoding a picture. H.264
-and HEVC in MP4 are units, each after its length; AV1 is OBUs, which hold theirs. The lengths must
-fill the packet exactly, and a bit at the head of each must be 0. What overwrote a part of the file
-(a block of zeros, of another file) breaks that in nearly every packet that it holds the head of. A
-bit that flipped inside a picture does not: only decoding tells that.
+Damaged packets are detected by their framing, without decoding. H.264 and HEVC in MP4 consist of
+units prefixed by their length, AV1 of OBUs that contain theirs. The lengths must fill the packet
+exactly, and one header bit of each must be 0. Overwritten parts of a file (with zeros, or a block
+of another file) violate this in nearly every packet whose header they cover. A flipped bit inside
+an image does not: only decoding shows it.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from av.error import FFmpegError
 from xop_lerobot.core.errors import BadDataset
 
 _LENGTH = 4
-"""Bytes of a unit's length, as every encoder that LeRobot uses writes it."""
+"""Size of a unit's length prefix [bytes], the same for every encoder that LeRobot uses."""
 _OBU_EXTENDED, _OBU_SIZED = 0x04, 0x02
 _OBU_KINDS = (1, 2, 3, 4, 5, 6, 7, 8, 15)
-"""All that are defined; others are reserved."""
+"""All defined OBU types; the others are reserved."""
 _OBU_PICTURES = (4, 6)
-"""Kinds that end a packet: tiles, and a whole picture. The last OBU may go without a length."""
+"""OBU types that end a packet: tile group and frame. The last OBU may lack a length."""
 
 
 def find_framing(codec: str, extradata: bytes | None) -> Callable[[bytes], bool] | None:
-    """Return what tells whether a packet is whole; None where that cannot be told.
+    """Return a function that checks whether a packet is intact; None if the codec has none.
 
     Args:
-        codec: Name of the codec, as FFmpeg has it.
-        extradata: The codec's head in the file.
+        codec: Name of the codec in FFmpeg.
+        extradata: Codec configuration record of the file.
     """
     if codec == "av1":
         return is_whole_av1
@@ -53,7 +53,7 @@ def find_framing(codec: str, extradata: bytes | None) -> Callable[[bytes], bool]
 
 
 def is_whole_nal(packet: bytes) -> bool:
-    """Whether a packet is units of H.264 or HEVC, each after its length of four bytes."""
+    """Whether a packet consists of H.264 or HEVC units with four-byte length prefixes."""
     place, end = 0, len(packet)
     while place + _LENGTH < end:
         length = int.from_bytes(packet[place : place + _LENGTH], "big")
@@ -64,7 +64,7 @@ def is_whole_nal(packet: bytes) -> bool:
 
 
 def is_whole_av1(packet: bytes) -> bool:
-    """Whether a packet is OBUs of AV1, the last of which may go without a length."""
+    """Whether a packet consists of AV1 OBUs, the last of which may lack a length."""
     place, end = 0, len(packet)
     while place < end:
         head = packet[place]
@@ -89,13 +89,13 @@ def is_whole_av1(packet: bytes) -> bool:
 
 @dataclass(frozen=True)
 class VideoIndex:
-    """Where the pictures of a video lie, in the order in which they are decoded.
+    """Packets of a video, in decoding order.
 
     Attributes:
-        pts: When each is shown, in units of `time_base`. Shape (n,).
+        pts: Presentation time of each, in units of `time_base`. Shape (n,).
         keys: Whether each is a key frame. Shape (n,), bool.
         time_base: Unit of the times [s].
-        damaged: Which of them are damaged, as far as their framing tells. Shape (m,).
+        damaged: Indices of packets with broken framing. Shape (m,).
     """
 
     pts: np.ndarray
@@ -105,11 +105,11 @@ class VideoIndex:
 
     @property
     def times(self) -> np.ndarray:
-        """When each picture is shown [s]. Shape (n,)."""
+        """Presentation time of each image [s]. Shape (n,)."""
         return self.pts * float(self.time_base)
 
     def count_missing(self, start: float, length: int, fps: float) -> int:
-        """Count those of `length` frames from `start` [s] on at which no picture is shown."""
+        """Count which of `length` frames from `start` [s] on have no image."""
         wanted = start + np.arange(length) / fps
         times = np.concatenate([[-np.inf], np.sort(self.times), [np.inf]])
         after = np.searchsorted(times, wanted)
@@ -117,9 +117,9 @@ class VideoIndex:
         return int((near > 0.25 / fps).sum())
 
     def count_damaged(self, start: float, stop: float, fps: float) -> int:
-        """Count the pictures from `start` to `stop` [s] that are damaged, or are made from such.
+        """Count the images from `start` to `stop` [s] that are damaged or depend on damaged ones.
 
-        What comes after a damaged picture is made from it, until the next key frame.
+        Images after a damaged one depend on it until the next key frame.
         """
         spoiled = np.zeros(len(self.pts), bool)
         keys = np.append(np.flatnonzero(self.keys), len(self.pts))
@@ -129,10 +129,10 @@ class VideoIndex:
         return int((spoiled & (times > start - half) & (times < stop - half)).sum())
 
     def find_groups(self, start: float, stop: float, fps: float) -> tuple[int, int] | None:
-        """Find the whole groups that hold what is shown from `start` to `stop` [s].
+        """Find the groups of pictures that contain the images from `start` to `stop` [s].
 
         Returns:
-            The first packet, and the one after the last; None if nothing is shown then.
+            First packet, and the packet after the last; None if there is no image.
         """
         half = 0.5 / fps
         shown = np.flatnonzero((self.times > start - half) & (self.times < stop - half))
@@ -146,10 +146,10 @@ class VideoIndex:
 
 
 def index_video(root: Path, file: Path) -> VideoIndex:
-    """Index the pictures of `root / file` without decoding them, and look at their framing.
+    """Index the packets of `root / file` and check their framing, without decoding.
 
     Raises:
-        BadDataset: If there is no such file, or it is no video.
+        BadDataset: If there is no such file, or it is not a video.
     """
     pts, keys, damaged, time_base = [], [], [], Fraction(1, 1)
     try:
@@ -161,7 +161,7 @@ def index_video(root: Path, file: Path) -> VideoIndex:
             for packet in container.demux(stream):
                 if packet.pts is None or packet.dts is None:
                     continue
-                # The file may be cut off in it, which the decoder's library does not always tell.
+                # A file cut off inside this packet; FFmpeg does not always flag it.
                 if packet.is_corrupt or (packet.pos or 0) + packet.size > size:
                     break
                 if is_whole is not None and not is_whole(bytes(packet)):
@@ -179,15 +179,15 @@ def index_video(root: Path, file: Path) -> VideoIndex:
 
 @dataclass(frozen=True)
 class Cut:
-    """A time span of a video.
+    """Time span of a video.
 
     Attributes:
         root: Directory of the dataset.
         file: The video, relative to it.
-        start: Time of the first picture [s].
-        stop: Time of the end of the last [s].
-        length: How many pictures should be in it; None where that is not known.
-        spare: How many of them may be missing, because the encoder dropped them.
+        start: Time of the first image [s].
+        stop: End time of the last image [s].
+        length: Expected number of images; None if unknown.
+        spare: Number of them that may be missing because the encoder dropped them.
     """
 
     root: Path
@@ -198,33 +198,33 @@ class Cut:
     spare: int = 0
 
     def check(self, index: VideoIndex, fps: float) -> None:
-        """Check that all its pictures are there and whole.
+        """Check that all its images are present and undamaged.
 
         Raises:
-            BadDataset: If not.
+            BadDataset: If an image is missing or damaged.
         """
         damaged = index.count_damaged(self.start, self.stop, fps)
         if damaged:
             raise BadDataset(
                 self.root,
-                f"{self.file} is damaged: {damaged} pictures from {self.start:.3f} s to "
+                f"{self.file} is damaged: {damaged} images from {self.start:.3f} s to "
                 f"{self.stop:.3f} s. `xop-curate repair` keeps the other episodes",
             )
         missing = index.count_missing(self.start, self.length or 0, fps)
         if missing > self.spare:
             raise BadDataset(
                 self.root,
-                f"{self.file} lacks {missing} of the {self.length} pictures from "
-                f"{self.start:.3f} s on, at {fps:g} Hz. `xop-curate repair` keeps what is whole",
+                f"{self.file} lacks {missing} of the {self.length} images from "
+                f"{self.start:.3f} s on, at {fps:g} Hz. `xop-curate repair` keeps what is complete",
             )
 
 
 class VideoFile:
-    """A new video, made of spans of another, one after another.
+    """A new video, concatenated from spans of one source video.
 
     Args:
-        path: Where it is written.
-        fps: Pictures a second [Hz].
+        path: Output path.
+        fps: Frame rate [Hz].
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -236,22 +236,22 @@ class VideoFile:
         path.parent.mkdir(parents=True, exist_ok=True)
 
     def add(self, cut: Cut, index: VideoIndex) -> tuple[float, float]:
-        """Add a span of a video.
+        """Append a span of the video.
 
         Args:
             cut: The span.
-            index: Index of its video, which is the same for all spans.
+            index: Index of its video, the same for all spans.
 
         Returns:
             Start and stop of the span in this file [s].
 
         Raises:
-            BadDataset: If nothing is shown then.
+            BadDataset: If the span contains no image.
         """
         groups = index.find_groups(cut.start, cut.stop, self._fps)
         if groups is None:
             raise BadDataset(
-                cut.root, f"{cut.file} shows nothing from {cut.start:.3f} s to {cut.stop:.3f} s"
+                cut.root, f"{cut.file} has no image from {cut.start:.3f} s to {cut.stop:.3f} s"
             )
         first, last = groups
         pts = index.pts[first:last]
@@ -279,7 +279,7 @@ class VideoFile:
                 count += 1
                 if count >= last:
                     break
-                # What a key frame's group shows before it belongs to the group before, too.
+                # Images shown before the key frame also depend on the group before it: skip them.
                 if count < first or packet.pts < lowest:
                     continue
                 packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
@@ -290,14 +290,14 @@ class VideoFile:
                 self._container.mux(packet)
 
     def close(self) -> None:
-        """Finish the file; may be called twice."""
+        """Close the file; may be called twice."""
         if self._container is not None:
             self._container.close()
             self._container = None
 
 
 def copy_whole(cut: Cut, index: VideoIndex, path: Path, fps: float) -> bool:
-    """Copy a video to `path` byte by byte if the span is all of it; tell whether it was."""
+    """Copy a video byte by byte if the span is all of it; return whether it was."""
     if index.find_groups(cut.start, cut.stop, fps) != (0, len(index.pts)):
         return False
     times = index.times
@@ -309,10 +309,10 @@ def copy_whole(cut: Cut, index: VideoIndex, path: Path, fps: float) -> bool:
 
 
 def decode(cut: Cut, fps: float, wanted: set[int]) -> Iterator[tuple[int, np.ndarray]]:
-    """Decode pictures of a span, those numbered `wanted` from its start on.
+    """Decode images of a span, by their index `wanted` from its start.
 
     Yields:
-        The number of each, and the picture. Shape (height, width, 3), uint8.
+        The number of each, and the image. Shape (height, width, 3), uint8.
 
     Raises:
         BadDataset: If the video is not readable.
@@ -338,5 +338,5 @@ def decode(cut: Cut, fps: float, wanted: set[int]) -> Iterator[tuple[int, np.nda
 
 
 def _say(error: Exception) -> str:
-    """Say what is wrong, without number and path."""
+    """Return the error message without number and path."""
     return getattr(error, "strerror", None) or str(error)

@@ -1,4 +1,4 @@
-"""The video files of a new dataset, one camera's."""
+"""Video files of a new dataset, for one camera."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from xop_lerobot.curate.video import (
 
 
 class VideoFiles:
-    """Writes episodes' pictures.
+    """Writes images of episodes.
 
-    A video that belongs to one episode is copied as it is. Episodes that come from one file, one
-    after another, go to one file again.
+    A video of a single episode is copied unchanged. Consecutive episodes from one source file share
+    a file.
 
     Args:
         root: Directory of the new dataset.
         template: `video_path` of its `meta/info.json`.
-        chunks_size: How many files go into a directory.
-        key: Feature of the camera.
-        fps: Pictures a second [Hz].
+        chunks_size: Number of files per directory.
+        key: Feature key of the camera.
+        fps: Frame rate [Hz].
     """
 
     def __init__(self, root: Path, template: str, chunks_size: int, key: str, fps: float) -> None:
@@ -38,13 +38,13 @@ class VideoFiles:
         self._file: VideoFile | None = None
 
     def write(self, cut: Cut) -> dict[str, Any]:
-        """Write the pictures of an episode.
+        """Write the images of an episode.
 
         Returns:
-            Where they are, as LeRobot's metadata of an episode says it.
+            Their location, as columns of LeRobot's episode metadata.
 
         Raises:
-            BadDataset: If they are not there, or the video is not readable.
+            BadDataset: If images are missing, or the video is not readable.
         """
         origin = (cut.root, cut.file)
         if origin != self._origin or self._index is None:
@@ -74,7 +74,7 @@ class VideoFiles:
         )
 
     def close(self) -> None:
-        """Finish the file; may be called twice."""
+        """Close the file; may be called twice."""
         if self._file is not None:
             self._file.close()
             self._file = None

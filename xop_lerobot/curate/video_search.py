@@ -1,4 +1,4 @@
-"""Images of episodes whose metadata does not say where they are, found by counting frames."""
+"""Locate images of episodes whose metadata does not state where they are, by counting frames."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from xop_lerobot.curate.video import VideoIndex, index_video
 
 @dataclass
 class _Gap:
-    """Pictures of a video, one after another, that the metadata gives to no episode.
+    """Consecutive images of a video that the metadata assigns to no episode.
 
     Attributes:
         file: The video, relative to the dataset's directory.
-        start: The first of them.
-        size: How many they are.
-        is_tail: Whether they are the last of the video, where an unfinished episode's may be.
-        low: They are of episodes after this one.
-        high: They are of episodes before this one.
-        used: How many of them are claimed.
+        start: Index of the first.
+        size: Number of images.
+        is_tail: Whether they end the video, where images of an unfinished episode may be.
+        low: They belong to episodes after this one.
+        high: They belong to episodes before this one.
+        used: Number of claimed images.
     """
 
     file: Path
@@ -38,19 +38,19 @@ class _Gap:
 
 
 class VideoSearch:
-    """Finds the pictures of episodes.
+    """Locates the images of episodes.
 
-    Where the metadata says where they are, and they are there and nobody else's, it is believed.
-    All others are found by counting: a recorder puts one episode's pictures after the other's
-    into a file, until it begins another one. So what no episode has between the pictures of
-    episodes 3 and 5 is episode 4's, if it is as many as that has rows.
+    The metadata is trusted where the images it states exist and no other episode claims them. All
+    others are located by counting: a recorder appends the images of consecutive episodes to a file
+    until it starts another. So unassigned images between those of episodes 3 and 5 belong to
+    episode 4 if their number matches its rows.
 
     Args:
         source: The dataset.
-        known: Episodes whose metadata is there.
-        found: Episodes of which there are rows, in order; those that are lost have pictures too.
-        lost: Indices of the episodes that are lost already, whose pictures are not checked.
-        note: Told what else is found.
+        known: Episodes with metadata.
+        found: Episodes with rows, in order; lost ones are included because they have images, too.
+        lost: Indices of episodes already known to be lost, whose images are not checked.
+        note: Receives further findings.
     """
 
     def __init__(
@@ -67,12 +67,12 @@ class VideoSearch:
         self._keys = [key for key, each in features if each["dtype"] == "video"]
         shared = source.video_use.shared
         self._faults: dict[int, str] = {}
-        """Why the pictures are not where the metadata says, by the episode's index."""
+        """Why the images are not where the metadata states, by episode index."""
         for entry in found if self._keys else ():
             if entry.index in shared:
                 self._faults[entry.index] = shared[entry.index][0]
             elif entry.videos.keys() != set(self._keys):
-                self._faults[entry.index] = "its pictures are gone"
+                self._faults[entry.index] = "its images are gone"
             elif entry.index not in lost:
                 fault = self._check(entry.videos, entry)
                 if fault:
@@ -83,7 +83,8 @@ class VideoSearch:
             if index not in self._faults and index not in shared
         }
         sought = [entry for entry in found if entry.index in self._faults]
-        # Pictures of an episode of which nothing else is left may lie between those of others.
+        # Images of a completely lost episode may lie between those of others: then a tail with
+        # superfluous images cannot be assigned.
         there = taken.keys() | self._faults.keys()
         self._is_strict = there != set(range(len(there)))
         self._spans: dict[int, dict[str, VideoSpan]] = {entry.index: {} for entry in sought}
@@ -91,7 +92,7 @@ class VideoSearch:
             self._claim(key, self._list_gaps(key, taken), sought)
 
     def find(self, entry: EpisodeEntry) -> Mapping[str, VideoSpan] | str:
-        """Find the pictures of an episode; say what is wrong where they are not to be had."""
+        """Return the location of an episode's images, or the fault if it is unknown."""
         fault = self._faults.get(entry.index)
         if fault is None:
             return entry.videos
@@ -100,11 +101,11 @@ class VideoSearch:
             return fault
         if entry.videos or entry.faults:
             places = ", ".join(f"{span.file} from {span.start:.2f} s on" for span in spans.values())
-            self._note(f"the pictures of episode {entry.index} are found: {places}")
+            self._note(f"the images of episode {entry.index} are found: {places}")
         return spans
 
     def _list_gaps(self, key: str, taken: Mapping[int, EpisodeEntry]) -> list[_Gap]:
-        """List the pictures of a camera that are nobody's, file by file."""
+        """List the unassigned images of a camera, file by file."""
         spans: dict[Path, list[tuple[int, int, int]]] = {}
         for index, entry in taken.items():
             span = entry.videos.get(key)
@@ -112,7 +113,7 @@ class VideoSearch:
                 start, stop = (round(each * self._fps) for each in (span.start, span.stop))
                 spans.setdefault(span.file, []).append((start, stop, index))
         gaps: list[_Gap] = []
-        held: list[tuple[int | None, _Gap | None]] = []  # what lies there, one after another
+        held: list[tuple[int | None, _Gap | None]] = []  # (episode, gap) in file order
         for file in self._list(key):
             place, size = 0, self._count(file)
             for start, stop, index in sorted(spans.get(file, ())):
@@ -136,7 +137,7 @@ class VideoSearch:
         return gaps
 
     def _claim(self, key: str, gaps: list[_Gap], sought: Sequence[EpisodeEntry]) -> None:
-        """Give what is nobody's to the episodes whose pictures are sought, all in their order."""
+        """Assign gaps to the episodes whose images are sought, both in order."""
         claims: list[tuple[EpisodeEntry, _Gap, int]] = []
         number = 0
         for entry in sought:
@@ -150,7 +151,7 @@ class VideoSearch:
         for gap in gaps[:number]:
             if 0 < gap.used < gap.size and gap.is_tail:
                 self._note(
-                    f"{gap.file}: {gap.size - gap.used} pictures at its end belong to no episode"
+                    f"{gap.file}: {gap.size - gap.used} images at its end belong to no episode"
                 )
         for entry, gap, start in claims:
             if gap.used == gap.size or (gap.is_tail and not self._is_strict):
@@ -175,16 +176,16 @@ class VideoSearch:
         return self._cache[file]
 
     def _check(self, spans: Mapping[str, VideoSpan], entry: EpisodeEntry) -> str:
-        """Check that the pictures of an episode are there; return what is wrong, or nothing."""
+        """Check the images of an episode; return the fault, empty if there is none."""
         for key, span in spans.items():
             index = self._index(span.file)
             if index is None:
-                return f"its pictures of '{key}' are not readable"
+                return f"its images of '{key}' are not readable"
             dropped = entry.facts.get("dropped_frames")
             missing = index.count_missing(span.start, entry.length, self._fps)
             if missing > (dropped if isinstance(dropped, int) else 0):
-                return f"{missing} of its {entry.length} pictures of '{key}' are gone"
+                return f"{missing} of its {entry.length} images of '{key}' are gone"
             damaged = index.count_damaged(span.start, span.stop, self._fps)
             if damaged:
-                return f"{damaged} of its {entry.length} pictures of '{key}' are damaged"
+                return f"{damaged} of its {entry.length} images of '{key}' are damaged"
         return ""
