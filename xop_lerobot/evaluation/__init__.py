@@ -1,1 +1,1 @@
-"""Evaluation of episodes: metrics, tables and images."""
+"""Evaluation: trials with a simulated person, their metrics, tables and reports."""

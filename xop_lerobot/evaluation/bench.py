@@ -1,12 +1,12 @@
-"""`xop-bench`: time of one step of the model predictive controller, and its parts.
+"""`xop-bench`: time of one step of the model predictive controller, and of its parts.
 
     xop-bench --robot g1 --mode mobile --samples 30 --horizon 3 --threads 2 --json bench.json
     xop-bench --robot rby1 --mode stationary --profile
 
-A robot follows a moving goal in lock-step, with sensor noise. Every solve of it is timed as a
-whole, state synchronisation and plan; right after it, the same number of physics steps is rolled
-out by one bare call of `mujoco.rollout`, with the same model, start state, controls and number of
-threads, so that whatever slows the machine down slows both.
+A robot follows a moving goal in lock-step, with sensor noise. Every solve is timed in full (state
+synchronisation and plan). Right after it, the same number of physics steps is rolled out by one
+bare call of `mujoco.rollout`, with the same model, start state, controls and threads, so that
+anything that slows the machine affects both.
 """
 
 from __future__ import annotations
@@ -56,17 +56,18 @@ from xop_lerobot.retarget.sync.state_sync import StateSync
 from xop_lerobot.teleoperation import TeleoperationConfig
 
 LEAD_IN_S = 1.0
-"""Time for which the first goal is the pose at home [s]."""
+"""Time for which the goal stays at the initial pose [s]."""
 CURVE_SPEED = 0.3
 """Speed of the moving goal [m/s]."""
 CURVE_TURN = 0.3
-"""Largest turn rate of the moving goal [rad/s]: a radius of 1 m."""
+"""Largest turn rate of the moving goal [rad/s], a radius of 1 m."""
 CURVE_PERIOD = 16.0
-"""Time in which the moving goal turns left and right once [s]."""
+"""Period of the moving goal's left and right turns [s]."""
 CURVE_S = 20.0
-"""Length of the moving goal's path [s]."""
+"""Duration of the moving goal's path [s]."""
 WAIST = np.array([-0.05, 0.0, -0.42])
-"""Where a person's waist is from the head, in the heading frame [m]: bends turn about it."""
+"""Position of a person's waist relative to the head, in the heading frame [m]; bends pivot
+there."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +77,16 @@ class BenchConfig:
     Attributes:
         robot: Name of the robot.
         mode: Mode of the robot.
-        samples: Rollouts per solve; 0 takes the preset's.
-        horizon: Length of a rollout in control steps of 20 ms; 0 takes the preset's.
-        threads: Threads of the physics; 0 takes one per core.
-        steps: Solves that are timed.
-        warmup: Solves before them.
+        samples: Rollouts per solve; 0 for the preset's.
+        horizon: Length of a rollout in control steps of 20 ms; 0 for the preset's.
+        threads: Physics threads; 0 for one per core.
+        steps: Number of timed solves.
+        warmup: Number of untimed solves before them.
         preset: Preset of the retargeter.
         low_level: Low-level policy; empty for the robot's own.
         low_level_path: Its file; empty for its default.
-        scene: Scene; its fixed boxes are obstacles.
-        noise: Preset of the sensors' noise.
+        scene: Scene; its static boxes are obstacles.
+        noise: Preset of the sensor noise.
         seed: Seed of sensors and samples.
     """
 
@@ -112,11 +113,11 @@ class BenchConfig:
 class BareRollout:
     """Lower bound: one call of `mujoco.rollout` for all physics steps of a solve.
 
-    It listens to the policy of a `PolicyRollout` for the controls.
+    It records the policy outputs of a `PolicyRollout` as controls.
 
     Args:
-        rollout: The rollout of the planner.
-        num_threads: Threads, as the planner's.
+        rollout: Rollout of the planner.
+        num_threads: Number of threads, as the planner's.
     """
 
     def __init__(self, rollout: PolicyRollout, num_threads: int) -> None:
@@ -131,7 +132,7 @@ class BareRollout:
             self._targets.append(output.targets)
             return output
 
-        # This instance alone, so that whatever else the planner asks of it is its own.
+        # Wrap `act` of this instance only; other policies and methods stay unchanged.
         vars(rollout.policy)["act"] = listen
 
     def forget(self) -> None:
@@ -139,13 +140,14 @@ class BareRollout:
         self._targets.clear()
 
     def run(self, state: RobotState, num_samples: int, horizon: int) -> float:
-        """Roll the controls of the last solve out again, from `state`; return the time [s].
+        """Repeat the rollouts of the last solve from `state`; return the time [s].
 
         Raises:
-            BadValue: If the planner did not ask its policy once for each control step.
+            BadValue: If the planner did not call its policy once per control step.
         """
         asked = self._targets
-        # A robot that ramps starts from the targets of what it executes: one more, of one sample.
+        # With ramped targets the policy is called once more, with one sample: for the command that
+        # the ramp starts from.
         ramps = len(asked) == horizon + 1 and asked[0].shape == (1, self.model.nu)
         begins = [np.repeat(asked[0], num_samples, axis=0), *asked[1:-1]] if ramps else asked
         asked = asked[1:] if ramps else asked
@@ -179,7 +181,7 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
     """Time the solves of a robot that follows a moving goal.
 
     Returns:
-        The figures of `KEYS`, the settings, the machine, and ``profile``: median time by part.
+        The metrics of `KEYS`, the settings, the machine, and ``profile``: median time by part.
 
     Raises:
         UnknownName: If a name in `config` is unknown.
@@ -231,7 +233,7 @@ def _time_solves(
     sync: StateSync,
     bare: BareRollout,
 ) -> list[dict[str, float]]:
-    """Repeat solve, bare rollout and robot step; times in seconds."""
+    """Repeat solve, bare rollout and robot step; returns times [s]."""
     mode, used = config.mode, retargeter.configs[config.mode]
     period = max(1, round(1 / used.control_hz / POLICY_DT)) * POLICY_DT
     site = retargeter.morphology.frames["head"]
@@ -262,14 +264,14 @@ def _time_solves(
 
 
 def move_from(home: np.ndarray, offset: tuple[float, float, float], yaw: float = 0) -> np.ndarray:
-    """Pose that is `offset` [m] and `yaw` [rad] away from home, in its heading frame. (7,)."""
+    """Return the pose at `offset` [m] and `yaw` [rad] in home's heading frame. Shape (7,)."""
     heading = quat_from_yaw(compute_heading(home[3:]))
     position = home[:3] + quat_rotate(heading, np.array(offset))
     return make_pose(position, quat_multiply(quat_from_yaw(yaw), home[3:]))
 
 
 def bend_from(home: np.ndarray, pitch: float = 0, yaw: float = 0) -> np.ndarray:
-    """Head pose after bending by `pitch` and turning by `yaw` [rad] at the waist. Shape (7,)."""
+    """Return the head pose after bending by `pitch` and `yaw` [rad] at the waist. Shape (7,)."""
     heading = quat_from_yaw(compute_heading(home[3:]))
     back = quat_from_yaw(-compute_heading(home[3:]))
     turn = quat_multiply(quat_multiply(heading, quat_from_rpy(0, pitch, yaw)), back)
@@ -279,15 +281,15 @@ def bend_from(home: np.ndarray, pitch: float = 0, yaw: float = 0) -> np.ndarray:
 
 
 def make_curve(home: np.ndarray) -> Callable[[float], np.ndarray]:
-    r"""A goal at 0.3 m/s whose heading is :math:`A(1 - \cos(2\pi t/T))`, after the lead-in.
+    r"""Make a goal at 0.3 m/s whose heading is :math:`A(1 - \cos(2\pi t/T))` after the lead-in.
 
-    A is such that the largest turn rate is `CURVE_TURN`; the head faces along the path.
+    A gives the largest turn rate `CURVE_TURN`; the head faces along the path.
 
     Args:
         home: Pose at the start. Shape (7,).
 
     Returns:
-        The pose at a time [s]. Shape (7,).
+        Function from time [s] to pose. Shape (7,).
     """
     omega = 2 * math.pi / CURVE_PERIOD
     amplitude = CURVE_TURN / omega
@@ -307,7 +309,7 @@ def make_curve(home: np.ndarray) -> Callable[[float], np.ndarray]:
 
 
 def _sway(home: np.ndarray, time: float) -> np.ndarray:
-    """Head pose of a standing person who keeps bending, turning and squatting. Shape (7,)."""
+    """Head pose of a standing person who bends, turns and squats continuously. Shape (7,)."""
     pose = bend_from(home, pitch=0.15 * np.sin(1.1 * time), yaw=0.4 * np.sin(0.7 * time))
     down = 0.06 * (1 - np.cos(0.9 * time))
     return make_pose(pose[:3] - np.array([0, 0, down]), pose[3:])
@@ -346,14 +348,14 @@ def make_parser() -> CommandParser:
         )
     for name, text in (
         ("preset", f"{', '.join(PRESETS)}"),
-        ("scene", "scene, whose fixed boxes are obstacles"),
+        ("scene", "scene, whose static boxes are obstacles"),
         ("noise", f"sensor noise: {', '.join(NOISE_PRESETS)}"),
     ):
         add(f"--{name}", default=defaults[name], help=f"{text} (default: {defaults[name]})")
     add("--low-level", default="", help="low-level policy (default: the robot's own)")
     add("--low-level-path", default="", help="file of the low-level policy (default: its own)")
-    add("--json", type=Path, help="file for the results; times in ms (default: none)")
-    add("--profile", action="store_true", help="print where the time of a step goes")
+    add("--json", type=Path, help="write the results as JSON; times in ms (default: none)")
+    add("--profile", action="store_true", help="print the time of each part of a step")
     return parser
 
 
@@ -361,7 +363,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[BenchConfig, argparse.Nam
     """Read the command line.
 
     Raises:
-        BadValue: If a flag is unknown, absent or malformed; an unknown one lists the known.
+        BadValue: If a flag is unknown, missing or malformed; an unknown one lists the known.
         UnknownName: If a mode or preset is unknown, listing the known ones.
     """
     args = make_parser().parse(arguments)

@@ -20,18 +20,18 @@ KEYS = (
     "overhead_ratio",
     "control_hz",
 )
-"""Figures of the JSON file that are a contract."""
+"""Metrics of the JSON file that are stable across versions."""
 
 
 def summarise(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Metrics of timed solves.
+    """Compute metrics of timed solves.
 
     Args:
-        rows: Times by part of every solve [s]; ``step`` is the whole, ``bare`` the bare rollout,
-            ``physics`` and ``policy`` their time within the solve.
+        rows: Times of every solve by part [s]; ``step`` is the total, ``bare`` the bare rollout,
+            ``physics`` and ``policy`` their share of the solve.
 
     Returns:
-        The figures of `KEYS`; ``control_hz_p99``, ``sync_ms_median``; ``overhead_ratio_p25`` and
+        The metrics of `KEYS`; ``control_hz_p99``, ``sync_ms_median``; ``overhead_ratio_p25`` and
         ``_p75``, quartiles of the ratio within single solves; ``profile`` by part [ms].
     """
     parts = {name: np.array([row[name] for row in rows]) * 1000 for name in rows[0]}
@@ -55,13 +55,13 @@ def summarise(rows: Sequence[Mapping[str, float]]) -> dict[str, Any]:
 
 
 def make_profile(medians: Mapping[str, float]) -> dict[str, float]:
-    """Split the step into parts; their medians add up to the step's only approximately.
+    """Split the step into parts; medians of parts add up only approximately.
 
     Args:
-        medians: Median time of every part [ms].
+        medians: Median time of each part [ms].
 
     Returns:
-        Time by part [ms]; ``other`` is what no part tells.
+        Time by part [ms]; ``other`` is the unaccounted rest.
     """
     profile = {"state sync": medians["sync"], "physics": medians["physics"]}
     profile["low-level policy"] = medians["policy"]
@@ -74,7 +74,7 @@ def make_profile(medians: Mapping[str, float]) -> dict[str, float]:
 
 
 def describe_machine() -> dict[str, str]:
-    """Processor, cores and versions, stored beside the results."""
+    """Return processor, cores and versions, which are stored with the results."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -92,22 +92,22 @@ def describe_machine() -> dict[str, str]:
 
 
 def describe_versions(machine: Mapping[str, Any]) -> str:
-    """The machine in one sentence."""
+    """Describe the machine in one sentence."""
     rest = [f"{name} {value}" for name, value in machine.items() if name != "processor"]
     return f"{machine['processor']}, {', '.join(rest)}."
 
 
 def make_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """Make a Markdown table."""
     lines = [headings, ["---"] * len(headings), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def make_bench_blocks(benches: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Blocks of docs/results/benchmarks.md: the machine, the results, and the profile.
+    """Make the blocks of docs/results/benchmarks.md: machine, results and profile.
 
     Args:
-        benches: Contents of JSON files of xop-bench, a row each.
+        benches: Contents of JSON files of xop-bench, one row each.
     """
     first = benches[0]
     machine = (

@@ -38,41 +38,41 @@ def make_parser() -> CommandParser:
     """Make the parser of the command line."""
     parser = CommandParser("xop-eval", __doc__)
     add = parser.add_argument
-    add("--config", type=Path, help="YAML file of a whole study; --robot, --task, --methods, "
-        "--variant and --low-level then choose from it (default: none)")  # fmt: skip
+    add("--config", type=Path, help="YAML file of a study; --robot, --task, --methods, "
+        "--variant and --low-level then select from it (default: none)")  # fmt: skip
     add("--robot", type=read_robot, help=say_robots())
     add("--task", help="dual_point_touch, box_pick_and_place or non_prehensile_transport")
     add("--methods", help="methods, comma-separated: mpc, mpc_no_sync, mpc_table1, direct, "
         "direct_amo (default: mpc,direct)")  # fmt: skip
-    add("--variant", help="variants of the methods, comma-separated; each is a binding of the "
-        "robot (v1, v2), upright and a preset (conservative, aggressive) with underscores "
-        "between, as v2_upright (default: the robot's own)")  # fmt: skip
+    add("--variant", help="variants of the methods, comma-separated; each joins a binding of the "
+        "robot (v1, v2), upright and a preset (conservative, aggressive) by underscores, "
+        "such as v2_upright (default: the robot's own)")  # fmt: skip
     add("--low-level", help="low-level policies, comma-separated: default, falcon, "
         "diff_drive (default: the robot's own)")  # fmt: skip
-    add("--low-level-path", help="files of low-level policies, as falcon=FILE,amo=FOLDER "
+    add("--low-level-path", help="files of low-level policies, such as falcon=FILE,amo=FOLDER "
         "(default: their own)")  # fmt: skip
-    add("--trials", type=int, help=f"trials of each cell (default: {DEFAULT_TRIALS})")
+    add("--trials", type=int, help=f"trials per cell (default: {DEFAULT_TRIALS})")
     add("--seed", type=int, help="seed of the first trial; the same for every method (default: 0)")
     add("--noise", help="sensor noise: off, mild or harsh (default: mild)")
     add("--scene", help="scene (default: the task's own)")
-    add("--heights", help="heights over the task's own, as support=0.35,table=0.6:0.7 or "
+    add("--heights", help="heights that override the task's, support=0.35,table=0.6:0.7 or "
         "points=0.3:0.5 [m] (default: the task's own)")  # fmt: skip
-    add("--fps", type=int, help="rate of the control loop, divides 50 [Hz] (default: 25)")
+    add("--fps", type=int, help="rate of the control loop, a divisor of 50 [Hz] (default: 25)")
     add("--time-limit", type=float,
         help="time limit of an episode [s] (default: the task's own)")  # fmt: skip
     add("--workers", type=int, default=0, help="parallel processes; 0: cores (default: 0)")
     add("--out", type=Path, default=Path("outputs/eval"),
         help="folder of the results; a study resumes from it (default: outputs/eval)")  # fmt: skip
-    add("--fresh", action="store_true", help="run every trial again, also finished ones")
-    add("--no-run", action="store_true", help="run nothing, only make tables of finished trials")
-    add("--json", type=Path, help="file for the table as a list of objects (default: none)")
-    add("--csv", type=Path, help="file for the table (default: none)")
+    add("--fresh", action="store_true", help="run all trials again, including finished ones")
+    add("--no-run", action="store_true", help="only make tables of finished trials")
+    add("--json", type=Path, help="write the table as a JSON list (default: none)")
+    add("--csv", type=Path, help="write the table as CSV (default: none)")
     add(
         "--report",
         type=Path,
         help="folder for a page with tables, plots and videos (default: none)",
     )
-    add("--videos", type=int, default=1, help="videos of each cell in the report (default: 1)")
+    add("--videos", type=int, default=1, help="videos per cell in the report (default: 1)")
     return parser
 
 
@@ -80,7 +80,7 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the command line.
 
     Raises:
-        BadValue: If a flag is absent or malformed.
+        BadValue: If a flag is missing or malformed.
         UnknownName: If a flag is unknown, listing the known ones.
     """
     args = make_parser().parse(arguments)
@@ -99,11 +99,11 @@ def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def make_study(args: argparse.Namespace) -> list[Any]:
-    """Make the cells that the arguments name.
+    """Make the cells of the study from the arguments.
 
     Raises:
         UnknownName: If a name is unknown, listing the known ones.
-        BadValue: If nothing is left of a study, or a value is out of its range.
+        BadValue: If no cell is left of a study, or a value is out of its range.
     """
     from xop_lerobot.evaluation.study import load_study, make_cells  # noqa: PLC0415
     from xop_lerobot.plant.config import NOISE_PRESETS  # noqa: PLC0415
@@ -135,7 +135,7 @@ def make_study(args: argparse.Namespace) -> list[Any]:
 
 
 def _parse_paths(text: str) -> dict[str, str]:
-    """Read `name=path` with commas between."""
+    """Parse comma-separated `name=path` pairs."""
     return dict(split_pair(part, "--low-level-path must be NAME=PATH") for part in text.split(","))
 
 
@@ -205,7 +205,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_jobs(cells: Sequence[Any], results: Any, jobs: Sequence[Any], workers: int) -> int:
-    """Run the jobs with a progress bar; returns how many ended in an error."""
+    """Run the jobs with a progress bar; returns the number of failures."""
     from tqdm import tqdm  # noqa: PLC0415
 
     from xop_lerobot.evaluation.study import run_study  # noqa: PLC0415
@@ -231,7 +231,7 @@ def _run_jobs(cells: Sequence[Any], results: Any, jobs: Sequence[Any], workers: 
 
 
 def describe(setup: Any) -> str:
-    """Robot, task, method, variant and low-level policy in words."""
+    """Robot, task, method, variant and low-level policy as text."""
     method = f"{setup.method} {setup.variant}".strip()
     return f"{setup.robot} {setup.place} {method} ({setup.low_level})"
 
@@ -248,14 +248,14 @@ def describe_outcome(record: Mapping[str, Any]) -> str:
 
 
 def _warn_of_mixture(found: Sequence[Sequence[Mapping[str, Any]]], folder: Path) -> None:
-    """Warn of trials that were run with other code."""
+    """Warn of trials that were run with another version of the code."""
     from xop_lerobot.evaluation.study import compute_code_digest  # noqa: PLC0415
 
     others = {record["code"] for trials in found for record in trials} - {compute_code_digest()}
     if others:
         count = sum(record["code"] in others for trials in found for record in trials)
         print(
-            f"{count} trials in '{folder}' are of another state of the code "
+            f"{count} trials in '{folder}' were run with another version of the code "
             f"({', '.join(sorted(others))}); --fresh runs them again",
             file=sys.stderr,
         )
@@ -296,7 +296,7 @@ def format_spread(mean: float | None, std: float | None, digits: int) -> str:
 def write_tables(
     rows: Sequence[Mapping[str, Any]], json_file: Path | None, csv_file: Path | None
 ) -> None:
-    """Write the rows as JSON and as CSV, where files are given."""
+    """Write the rows as JSON and as CSV, if files are given."""
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Images of an episode: a strip of labelled moments, a video and a GIF."""
+"""Images of an episode: a strip of labelled frames, a video and a GIF."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from PIL import Image, ImageDraw, ImageFont
 from xop_lerobot.core.errors import BadShape, BadValue, UnknownName
 
 LABEL_HEIGHT = 22
-"""Height of the line of text over a picture [px]."""
+"""Height of the caption above an image [px]."""
 GAP = 4
-"""White space between pictures [px]."""
+"""White space between images [px]."""
 FONT_SIZE = 15
 
 
 def choose_moments(count: int, number: int = 8) -> np.ndarray:
-    """Choose `number` frames of `count`, evenly from the first to the last. Shape (<= number,)."""
+    """Choose `number` of `count` frames, evenly from first to last. Shape (<= number,)."""
     if count < 1:
         raise BadValue("the episode has no frame to show")
     return np.unique(np.linspace(0, count - 1, min(number, count)).round().astype(int))
 
 
 def build_strip(cameras: Mapping[str, np.ndarray], fps: float, number: int = 8) -> np.ndarray:
-    """Put moments of an episode side by side, one row per camera, with their times.
+    """Arrange frames of an episode side by side, one row per camera, captioned with their times.
 
     Args:
         cameras: Frames of each camera, all equally long. Shapes (T, height, width, 3), uint8.
-        fps: Frames per second.
-        number: Number of moments.
+        fps: Frame rate [Hz].
+        number: Number of frames shown.
 
     Returns:
         The strip. Shape (rows, columns, 3), uint8.
 
     Raises:
-        BadShape: If a camera's frames are no RGB film, or the lengths differ.
+        BadShape: If a camera's frames are not an RGB video, or the lengths differ.
         BadValue: If there is no camera or no frame.
     """
     count = check_cameras(cameras)
@@ -81,8 +81,8 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
 
     Args:
         path: File to write, ``.mp4``.
-        frames: Pictures of one, even size. Shapes (height, width, 3), uint8.
-        fps: Frames per second.
+        frames: Images of one, even size. Shapes (height, width, 3), uint8.
+        fps: Frame rate [Hz].
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
@@ -133,7 +133,7 @@ def read_camera(dataset: Any, camera: str, episode: int = 0) -> np.ndarray:
 
     Raises:
         UnknownName: If the dataset has no such camera; lists its cameras.
-        BadValue: If the film has fewer frames than the episode.
+        BadValue: If the video has fewer frames than the episode.
     """
     prefix = "observation.images."
     key = f"{prefix}{camera}"
@@ -142,7 +142,7 @@ def read_camera(dataset: Any, camera: str, episode: int = 0) -> np.ndarray:
         raise UnknownName("camera", camera, known)
     meta = dataset.meta.episodes[episode]
     length = int(meta["length"])
-    # Episodes share a file; each begins at a stamp of its own.
+    # Episodes share a file; the metadata states where each begins.
     begin = float(meta[f"videos/{key}/from_timestamp"])
     half_frame = 0.5 / dataset.meta.fps
     frames: list[np.ndarray] = []
@@ -159,7 +159,7 @@ def check_cameras(cameras: Mapping[str, np.ndarray]) -> int:
     """Return the number of frames that all `cameras` have.
 
     Raises:
-        BadShape: If one is no RGB film, or the lengths differ.
+        BadShape: If one is not an RGB video, or the lengths differ.
         BadValue: If there is no camera.
     """
     if not cameras:
@@ -172,7 +172,7 @@ def check_cameras(cameras: Mapping[str, np.ndarray]) -> int:
 
 
 def _put_label(picture: np.ndarray, text: str) -> np.ndarray:
-    """Add a line of black text on white above `picture`."""
+    """Add a caption, black on white, above an image."""
     height, width = picture.shape[:2]
     canvas = Image.new("RGB", (width, height + LABEL_HEIGHT), "white")
     canvas.paste(Image.fromarray(picture), (0, LABEL_HEIGHT))
@@ -182,7 +182,7 @@ def _put_label(picture: np.ndarray, text: str) -> np.ndarray:
 
 
 def _pad(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Add white below and to the right up to `height` and `width`."""
+    """Pad with white below and to the right up to `height` and `width`."""
     missing = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
     return np.pad(picture, missing, constant_values=255)
 

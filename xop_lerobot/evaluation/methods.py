@@ -1,8 +1,7 @@
 """Methods and variants of a study, by name.
 
-A method is a retargeter with a low-level policy. A variant is what a user could also set for it:
-a binding that the robot names, constraints, a preset, with underscores between
-(`v2_upright_conservative`).
+A method is a retargeter with a low-level policy. A variant is a set of user options: a binding that
+the robot names, constraints and a preset, joined by underscores (`v2_upright_conservative`).
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from xop_lerobot.retarget.config import CONSTRAINTS, PRESETS, RetargeterConfig
 
 @dataclass(frozen=True)
 class Method:
-    """One method.
+    """Method of a study.
 
     Attributes:
-        title: What it is, for tables.
+        title: Description for tables.
         retargeter: Settings of `RetargeterConfig`.
-        low_level: Low-level policy that it always has; empty takes the one that is asked for.
+        low_level: Low-level policy of the method; empty to use the requested one.
     """
 
     title: str
@@ -43,7 +42,7 @@ METHODS: dict[str, Method] = {
 
 
 def get_method(name: str) -> Method:
-    """Look the method `name` up.
+    """Return the method `name`.
 
     Raises:
         UnknownName: Listing the known ones.
@@ -54,17 +53,17 @@ def get_method(name: str) -> Method:
 
 
 def parse_variant(morphology: Morphology, variant: str) -> dict[str, str]:
-    """Read a variant: a binding of the robot, constraints and a preset, in any order.
+    """Parse a variant: a binding of the robot, constraints and a preset, in any order.
 
     Args:
         morphology: The robot.
-        variant: Names with underscores between; empty for the robot's own defaults.
+        variant: Names joined by underscores; empty for the robot's defaults.
 
     Returns:
         Settings of `RetargeterConfig`.
 
     Raises:
-        UnknownName: If a part is none of these, listing what is.
+        UnknownName: If a part is none of these, listing the known ones.
         BadValue: If there are two bindings or two presets.
     """
     bindings, constraints, presets = [], [], []
@@ -94,7 +93,7 @@ def make_retargeter_config(
 ) -> RetargeterConfig:
     """Make the retargeter's configuration for one trial, with a single thread.
 
-    Trials run side by side, one to a core: threads of their own would only be in their way.
+    Trials run in parallel, one per core, so more threads per trial would only compete.
 
     Raises:
         UnknownName: If method or variant are unknown, listing the known ones.
@@ -112,12 +111,12 @@ def make_retargeter_config(
 
 
 def resolve_low_level(morphology: Morphology, method: str, low_level: str = "") -> str:
-    """Name of the low-level policy with which `method` runs.
+    """Return the name of the low-level policy that `method` runs with.
 
     Args:
         morphology: The robot.
         method: Name of the method.
-        low_level: What was asked for; empty for the robot's own.
+        low_level: Requested policy; empty for the robot's own.
 
     Raises:
         UnknownName: If it does not fit the robot, listing those that do.
@@ -126,7 +125,7 @@ def resolve_low_level(morphology: Morphology, method: str, low_level: str = "") 
 
 
 def find_absence(low_level: str, path: str = "") -> str:
-    """Reason why a low-level policy cannot run here; empty if it can."""
+    """Return why a low-level policy cannot run here; empty if it can."""
     try:
         make_policy(low_level, path or None)
     except PolicyFileError as error:

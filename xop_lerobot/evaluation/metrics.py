@@ -1,7 +1,7 @@
-r"""The paper's figures of one trial, and some more: pure functions of arrays.
+r"""Metrics of one trial, those of the paper and further ones: pure functions of arrays.
 
-Arrays have one row for each tick of the control loop, `n` in all. What a figure would be an
-average of may never have come (no tick in standing mode, no goal); the figure is nan then.
+Arrays have one row per control step ("tick"), `n` in all. A metric whose average has no samples (no
+tick in standing mode, no goal) is nan.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from xop_lerobot.core.errors import BadShape, BadValue
 from xop_lerobot.core.transforms import quat_rotate, rotation_error
 
 JERK_WINDOW_S = 0.24
-"""Length of the filter under which jerk is computed [s]."""
+"""Length of the filter window for jerk [s]."""
 JERK_ORDER = 3
-"""Order of the filter's polynomial."""
+"""Polynomial order of the filter."""
 NEVER = float("nan")
-"""What a figure is that no tick contributed to."""
+"""Value of a metric without samples."""
 
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 class BalancePower(NamedTuple):
-    """Average power of the lower body while it stands.
+    """Average power of the lower body while standing.
 
     Attributes:
-        absolute: With every joint's power as a magnitude, the paper's ABP [W].
-        signed: With braking as negative power [W].
+        absolute: Mean magnitude of joint power, the paper's ABP [W].
+        signed: Mean joint power, negative while braking [W].
     """
 
     absolute: float
@@ -37,12 +37,12 @@ class BalancePower(NamedTuple):
 
 
 class TrackingFigures(NamedTuple):
-    """How far frames of the robot are from their goals.
+    """Errors of robot frames relative to their goals.
 
     Attributes:
         mean: Mean distance [m].
         p95: 95th percentile of the distance [m].
-        angle_mean: Mean angle of the rotation to the goal [rad].
+        angle_mean: Mean rotation angle to the goal [rad].
         angle_p95: 95th percentile of that angle [rad].
     """
 
@@ -58,19 +58,19 @@ def compute_balance_power(
     r"""Compute :math:`\text{ABP} = \frac1K\sum_{k=1}^K\frac1m\sum_{l=1}^m P_l(t_k)`.
 
     K are the ticks in standing mode, m the joints of the lower body. The paper's motor power
-    :math:`P_l = \tau_l\dot q_l` is taken as a magnitude, :math:`|\tau_l\dot q_l|`: a motor that
-    brakes works too, and over a whole squat the signed power would cancel out.
+    :math:`P_l = \tau_l\dot q_l` is taken as a magnitude, :math:`|\tau_l\dot q_l|`: a braking motor
+    also works, and over a whole squat the signed power would cancel.
 
     Args:
-        effort: Torque of each joint of the lower body [N m]. Shape (n, m).
-        velocity: Velocity of each of them [rad/s]. Shape (n, m).
+        effort: Torque of each lower-body joint [N m]. Shape (n, m).
+        velocity: Velocity of each lower-body joint [rad/s]. Shape (n, m).
         standing: Whether the robot is in standing mode. Shape (n,), bool.
 
     Returns:
-        Average power of a joint [W], nan if the robot never stands.
+        Average power per joint [W], nan if the robot never stands.
 
     Raises:
-        BadShape: If the shapes do not fit.
+        BadShape: If the shapes do not match.
     """
     if effort.ndim != 2 or velocity.shape != effort.shape:
         raise BadShape("velocity", effort.shape, velocity.shape)
@@ -89,25 +89,25 @@ def compute_jerk(
 ) -> float:
     r"""Compute the mean jerk :math:`\frac1n\sum_k\lVert\dddot p(t_k)\rVert` [m/s³].
 
-    The third derivative is that of a Savitzky-Golay filter: a cubic fitted by least squares to
-    `window_s` about each tick (7 points at 25 Hz). Motion up to about 4 Hz passes, which is all
-    that a hand does; the bare third difference would tell of rounding and of the rate.
+    The third derivative is that of a Savitzky-Golay filter: a cubic least-squares fit over
+    `window_s` around each tick (7 points at 25 Hz). It passes motion up to about 4 Hz, the band of
+    hand motion; a plain third difference would measure rounding and depend on the rate.
 
     Args:
         position: Position of a point [m]. Shape (n, 3).
         dt: Time between ticks [s].
-        chosen: Ticks that count, all where None; the filter never reaches beyond a run of them.
-            Shape (n,), bool.
-        window_s: Length of the filter [s].
+        chosen: Ticks to use, None for all; the filter never crosses the end of a run of them. Shape
+            (n,), bool.
+        window_s: Length of the filter window [s].
 
     Returns:
-        Jerk, nan if no run of chosen ticks is as long as the filter.
+        Mean jerk, nan if no run of chosen ticks is as long as the filter window.
 
     Raises:
-        BadShape: If the shapes do not fit.
+        BadShape: If the shapes do not match.
         BadValue: If the filter has fewer points than its polynomial needs.
     """
-    from scipy.signal import savgol_filter  # noqa: PLC0415 most of a second, for this one figure
+    from scipy.signal import savgol_filter  # noqa: PLC0415 slow import, for this metric only
 
     if position.ndim != 2 or position.shape[1] != 3:
         raise BadShape("position", ("n", 3), position.shape)
@@ -132,15 +132,15 @@ def compute_jerk(
 def compute_tilt(quat: np.ndarray, chosen: np.ndarray | None = None) -> float:
     r"""Compute the mean tilt :math:`\frac1n\sum_k\arccos(s\,e_z^T R(t_k)\,e_z)` of a hand [rad].
 
-    The Z of a wrist points out of the back of the hand. s is the side that is up in the first
-    of the ticks: 1 for the back, -1 for the palm, so that a hand that turns over counts as π.
+    The Z axis of a wrist points out of the back of the hand. s is the side that is up in the first
+    of the ticks: 1 for the back, -1 for the palm, so a hand that turns over reaches π.
 
     Args:
         quat: Orientation of the wrist, wxyz. Shape (n, 4).
-        chosen: Ticks that count, all where None. Shape (n,), bool.
+        chosen: Ticks to use, None for all. Shape (n,), bool.
 
     Returns:
-        Tilt, nan if no tick is chosen.
+        Mean tilt, nan if no tick is chosen.
     """
     cosine = quat_rotate(quat, _UP)[:, 2]
     if chosen is not None:
@@ -163,7 +163,7 @@ def compute_pose_errors(pose: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray,
         Distance and angle in each tick. Shapes (n,).
 
     Raises:
-        BadShape: If the shapes do not fit.
+        BadShape: If the shapes do not match.
     """
     if goal.shape != pose.shape or pose.shape[1:] != (7,):
         raise BadShape("goal", (len(pose), 7), goal.shape)
@@ -175,11 +175,11 @@ def compute_pose_errors(pose: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray,
 def summarise_errors(
     errors: Sequence[tuple[np.ndarray, np.ndarray]], chosen: np.ndarray
 ) -> TrackingFigures:
-    """Summarise `compute_pose_errors` of one or several frames of the robot, all pooled.
+    """Summarise `compute_pose_errors` of one or several robot frames, pooled.
 
     Args:
-        errors: Distance and angle of each, as `compute_pose_errors` gives them.
-        chosen: Ticks that count. Shape (n,), bool.
+        errors: Distance and angle of each, from `compute_pose_errors`.
+        chosen: Ticks to use. Shape (n,), bool.
     """
     if not errors or not chosen.any():
         return TrackingFigures(NEVER, NEVER, NEVER, NEVER)
@@ -194,7 +194,7 @@ def summarise_errors(
 
 
 def compute_tracking_error(pose: np.ndarray, goal: np.ndarray) -> TrackingFigures:
-    """Summarise the errors of one frame of the robot in the ticks in which it has a goal.
+    """Summarise the errors of one robot frame over the ticks with a goal.
 
     Args:
         pose: True pose of the frame. Shape (n, 7).
@@ -205,10 +205,10 @@ def compute_tracking_error(pose: np.ndarray, goal: np.ndarray) -> TrackingFigure
 
 
 def compute_roughness(command: np.ndarray, half_range: np.ndarray, dt: float) -> float:
-    r"""Compute how rough commands are: :math:`\sqrt{\overline{(\ddot a_i / \hat a_i)^2}}` [1/s²].
+    r"""Compute the roughness of commands :math:`\sqrt{\overline{(\ddot a_i / \hat a_i)^2}}` [1/s²].
 
     The second difference :math:`\ddot a_i = (a_{n} - 2a_{n-1} + a_{n-2})/dt^2` of each entry is
-    over half its range :math:`\hat a_i`, and the mean is over entries and ticks.
+    divided by half its range :math:`\hat a_i`; the mean is over entries and ticks.
 
     Args:
         command: Executed commands. Shape (n, k).
@@ -227,18 +227,18 @@ def compute_roughness(command: np.ndarray, half_range: np.ndarray, dt: float) ->
 
 
 def compute_slip(feet: np.ndarray, dt: float, height: float = 0.01) -> float:
-    r"""Compute how fast feet slide while they bear: mean of :math:`\lVert v_{xy}\rVert` [m/s].
+    r"""Compute the slip of feet in contact: mean of :math:`\lVert v_{xy}\rVert` [m/s].
 
-    A foot bears in a tick if, before it and after it, its middle is within `height` of the
-    lowest place where that foot has been.
+    A foot counts as in contact between two ticks if in both its middle is within `height` of the
+    lowest height that it ever reached.
 
     Args:
         feet: Middle of each foot [m]. Shape (n, f, 3).
         dt: Time between ticks [s].
-        height: How far over its lowest place a foot still bears [m].
+        height: Height above the lowest one up to which a foot is in contact [m].
 
     Returns:
-        Speed, nan if no foot ever bears for two ticks.
+        Mean speed, nan if no foot is ever in contact for two ticks.
     """
     if feet.ndim != 3 or not feet.size:
         return NEVER
@@ -249,17 +249,17 @@ def compute_slip(feet: np.ndarray, dt: float, height: float = 0.01) -> float:
 
 
 def compute_falls(base_pose: np.ndarray, fall_height: float, fall_tilt: float) -> int:
-    r"""Count how often a base falls: lower than `fall_height` or tilted over `fall_tilt`.
+    r"""Count the falls: base lower than `fall_height` or tilted by more than `fall_tilt`.
 
-    The tilt is :math:`\arccos(e_z \cdot R e_z)`. A robot that stays down has fallen once.
+    The tilt is :math:`\arccos(e_z \cdot R e_z)`. A robot that stays down counts once.
 
     Args:
-        base_pose: Base in the world. Shape (T, 7).
-        fall_height: Height under which it counts as fallen [m].
-        fall_tilt: Tilt over which it counts as fallen [rad].
+        base_pose: Pose of the base in the world. Shape (T, 7).
+        fall_height: Height below which it counts as fallen [m].
+        fall_tilt: Tilt above which it counts as fallen [rad].
 
     Returns:
-        Number of times the robot went down.
+        Number of falls.
     """
     base_pose = np.asarray(base_pose, float)
     up = quat_rotate(base_pose[:, 3:], _UP)
@@ -269,17 +269,17 @@ def compute_falls(base_pose: np.ndarray, fall_height: float, fall_tilt: float) -
 
 
 def compute_longest_hold(within: np.ndarray, dt: float) -> float:
-    """Compute the longest time for which `within` held without a break [s].
+    """Compute the longest time for which `within` held without interruption [s].
 
-    A run of k ticks spans k - 1 periods. It tells a touch (both hands within 5 cm for 3 s) from
-    trajectories alone, as a check on the physics' own verdict.
+    A run of k ticks spans k - 1 periods. It detects a touch (both hands within 5 cm for 3 s) from
+    trajectories alone, as a check of the simulation's own verdict.
     """
     runs = find_runs(np.asarray(within, bool))
     return max(((last - first - 1) * dt for first, last in runs), default=0.0)
 
 
 def find_runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """Find the runs of true flags, as first tick and the one after the last."""
+    """Return the runs of true flags, as first tick and the tick after the last."""
     padded = np.concatenate([[False], np.asarray(flags, bool), [False]])
     edges = np.flatnonzero(padded[1:] != padded[:-1])
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

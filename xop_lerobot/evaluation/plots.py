@@ -36,7 +36,7 @@ MEANS: dict[str, tuple[str, float]] = {
     "roughness": ("roughness of commands [1/s²]", 1.0),
     "plan_p99_ms": ("solve, 99th percentile [ms]", 1.0),
 }
-"""Title and scale of each figure that is plotted."""
+"""Title and scale of each plotted metric."""
 
 
 def _make_figure(columns: int, rows: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
@@ -56,13 +56,13 @@ def _to_png(figure: Figure) -> bytes:
 
 
 def plot_rates(cells: Mapping[str, tuple[str, Trials]]) -> bytes:
-    """Draw the rates of each cell, with 95% intervals.
+    """Plot the rates of each cell, with 95% intervals.
 
     Args:
-        cells: Method and trials of each cell, by its label; cells without trials are left out.
+        cells: Method and trials of each cell, by label; cells without trials are skipped.
 
     Returns:
-        A PNG picture.
+        A PNG image.
     """
     shown = {label: cell for label, cell in cells.items() if cell[1]}
     rates = {
@@ -91,15 +91,15 @@ def plot_rates(cells: Mapping[str, tuple[str, Trials]]) -> bytes:
 
 
 def plot_means(cells: Mapping[str, tuple[str, Trials]]) -> bytes | None:
-    """Draw every trial's metrics, their mean and its 95% interval.
+    """Plot the metrics of every trial, their mean and its 95% interval.
 
-    Completion times are of successful trials alone. A figure that no trial has is left out.
+    Completion times are of successful trials only. A metric that no trial has is skipped.
 
     Args:
         cells: As in `plot_rates`.
 
     Returns:
-        A PNG picture, None where there is nothing to draw.
+        A PNG image, None if there is nothing to plot.
     """
     shown = {label: cell for label, cell in cells.items() if cell[1]}
     names = [
@@ -135,7 +135,7 @@ def plot_means(cells: Mapping[str, tuple[str, Trials]]) -> bytes | None:
 
 
 def find_values(trials: Trials, name: str) -> list[float]:
-    """Values of a metric; completion times of successful trials only."""
+    """Return the values of a metric; completion times of successful trials only."""
     if name == "completion_s":
         return [trial[name] for trial in trials if trial["success"]]
     found = (trial["metrics"].get(name) for trial in trials)
@@ -143,20 +143,20 @@ def find_values(trials: Trials, name: str) -> list[float]:
 
 
 def plot_ways(cells: Mapping[str, tuple[str, Trials]]) -> bytes:
-    """Draw the path of the head, seen from above, in every trial of each cell.
+    """Plot the path of the head, seen from above, for every trial of each cell.
 
     Args:
         cells: As in `plot_rates`.
 
     Returns:
-        A PNG picture.
+        A PNG image.
     """
     shown = {label: cell for label, cell in cells.items() if cell[1]}
     return _plot_each(shown, _draw_ways, equal=True)
 
 
 def plot_errors(cells: Mapping[str, tuple[str, Trials]]) -> bytes:
-    """Draw the errors of head and hands over time in the first trial of each cell."""
+    """Plot errors of head and hands over time for the first trial of each cell, as PNG."""
     shown = {label: cell for label, cell in cells.items() if cell[1]}
     return _plot_each(shown, _draw_errors, equal=False)
 

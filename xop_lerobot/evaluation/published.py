@@ -1,7 +1,7 @@
-"""Results of the paper: 10 trials per row, human operators with a real headset.
+"""Results published in the paper: 10 trials per row, human operators with a real headset.
 
-From Tables II to IV of the paper. They stand beside ours for orientation: its operators, rooms
-and points are not ours, and its AMO and FALCON are the released networks.
+From its Tables II to IV. They are shown beside ours for orientation only: operators, rooms and
+points differ, and its AMO and FALCON are the released networks.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ SIMULATION, REAL = "simulation", "real robot"
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """One row of the paper's tables, counts out of 10; None where the paper gives no figure.
+    """One row of the paper's tables, counts out of 10; None where the paper gives no value.
 
     Attributes:
-        robot: Robot, by our name.
-        task: Task, by our name.
-        method: Method, by our name.
-        variant: Variant, by our name.
-        low_level: Low-level policy, by our name.
-        setting: Where it was measured.
+        robot: Robot, by its name here.
+        task: Task, by its name here.
+        method: Method, by its name here.
+        variant: Variant, by its name here.
+        low_level: Low-level policy, by its name here.
+        setting: Simulation or real robot.
         success: Successful trials (TSR, PPSR or DSR).
         pickup: Trials in which the box was picked up (PSR).
         collision: Trials with a collision (CR).
@@ -113,13 +113,13 @@ PUBLISHED: tuple[PublishedRow, ...] = (
     _transport("v2_upright_conservative", 7, (40.75, 1.06), (0.05, 0.03), (769.99, 11.02)),
     _transport("v2_upright_aggressive", 6, (24.50, 3.50), (0.01, 0.01), (2144.55, 87.80)),
 )  # fmt: skip
-"""Every row."""
+"""All rows."""
 
 PUBLISHED_TRIALS = 10
 
 
 def find_published(robot: str, task: str, setting: str | None = None) -> list[PublishedRow]:
-    """Rows of the paper on a task of a robot, in its order."""
+    """Return the paper's rows for a task of a robot, in its order."""
     return [
         row
         for row in PUBLISHED

@@ -1,6 +1,7 @@
-"""Page of a study: tables beside the paper's, plots with intervals, a video of each cell.
+"""Page of a study: tables beside the paper's, plots with intervals, one video per cell.
 
-One HTML file that needs no other: pictures and films are inside it. The films lie beside it too.
+A single self-contained HTML file with images and videos embedded. The videos are also written
+beside it.
 """
 
 from __future__ import annotations
@@ -38,16 +39,16 @@ from xop_lerobot.plant.rendering import RenderingUnavailable
 WIDTH, HEIGHT = 320, 240
 CAMERA = "task"
 LOOK_HEIGHT, DISTANCE = 0.75, 2.6
-"""Where a camera that follows a robot looks over the ground, and from how far [m]."""
+"""Height above the ground of a following camera's target, and its distance [m]."""
 SMOOTHING_S = 0.7
-"""Standard deviation of the filter of the way that it follows [s]."""
+"""Standard deviation of the Gaussian filter on the path that the camera follows [s]."""
 
 
 def load_film(path: Path) -> Film:
-    """Read the positions of a trial.
+    """Read the recorded positions of a trial.
 
     Raises:
-        BadValue: If the file is missing or holds something else.
+        BadValue: If the file is missing or malformed.
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
@@ -61,16 +62,16 @@ def load_film(path: Path) -> Film:
 def render_film(
     setup: TrialSetup, seed: int, film: Film, camera: str = CAMERA
 ) -> Iterator[np.ndarray]:
-    """Yield an image of each position. Shapes (240, 320, 3), uint8.
+    """Yield an image per recorded position. Shapes (240, 320, 3), uint8.
 
     Args:
-        setup: What was tried; its robot, scene and furniture are built anew.
-        seed: Its seed.
-        film: Its positions.
+        setup: Setup of the trial, from which robot, scene and furniture are rebuilt.
+        seed: Seed of the trial.
+        film: Recorded positions.
         camera: Camera of the scene.
 
     Raises:
-        BadValue: If the scene has changed since.
+        BadValue: If the scene has changed since the recording.
         RenderingUnavailable: If this machine has no OpenGL.
     """
     stage = make_stage(setup, seed)
@@ -84,28 +85,28 @@ def render_film(
                     f"the scene of '{setup.task}' has {name} of shape {there}, the trial was "
                     f"recorded with {kept}. Run it again with --fresh"
                 )
-        ways = None if _has_walls(plant.model) else _smooth(film.qpos[:, :2], film.fps)
+        path = None if _has_walls(plant.model) else _smooth(film.qpos[:, :2], film.fps)
         for index, rows in enumerate(zip(film.qpos, film.mocap_pos, film.mocap_quat, strict=True)):
             data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = rows
-            if ways is not None:
-                _follow(plant.model, camera, ways[index])
+            if path is not None:
+                _follow(plant.model, camera, path[index])
             yield plant.render(camera)
     finally:
         plant.close()
 
 
 def _has_walls(model: mujoco.MjModel) -> bool:
-    """Whether the camera must stay in its room."""
+    """Whether the scene has walls, which would hide the robot from a following camera."""
     return any(model.geom(index).name.startswith("wall_") for index in range(model.ngeom))
 
 
-def _smooth(way: np.ndarray, fps: int) -> np.ndarray:
+def _smooth(path: np.ndarray, fps: int) -> np.ndarray:
     """Smoothed path for a camera to follow. Shape (p, 2)."""
-    return gaussian_filter1d(way.astype(float), SMOOTHING_S * fps, axis=0, mode="nearest")
+    return gaussian_filter1d(path.astype(float), SMOOTHING_S * fps, axis=0, mode="nearest")
 
 
 def _follow(model: mujoco.MjModel, camera: str, place: np.ndarray) -> None:
-    """Move a fixed camera to look at the robot from nearby."""
+    """Move a fixed camera to look at the robot from nearby, keeping its orientation."""
     index = model.camera(camera).id
     back = quat_rotate(model.cam_quat[index], np.array([0.0, 0.0, 1.0]))
     model.cam_pos[index] = np.array([*place, LOOK_HEIGHT]) + DISTANCE * back
@@ -114,7 +115,7 @@ def _follow(model: mujoco.MjModel, camera: str, place: np.ndarray) -> None:
 def write_film(
     path: Path, record: Mapping[str, Any], setup: TrialSetup, film: Film, camera: str = CAMERA
 ) -> int:
-    """Write the video of a trial, with its method and time, and return the number of frames."""
+    """Write a trial's video, captioned with method and time; return the number of frames."""
     frames = np.stack(list(render_film(setup, record["seed"], film, camera)))
     end = "success" if record["success"] else record["failure"] or "time is up"
     label = f"{setup.method} {setup.variant}".strip()
@@ -131,11 +132,11 @@ tr.absent td { color: #999; }
 """
 _EXPLANATION = """
 <p class="note">Ours: a simulated person in the headset, the same one with the same seed for every
-method; sensors with noise; success decided by the physics. Counts are out of all trials, with
-Wilson's 95% interval; means have their standard deviation and, small, the 95% interval of the mean
-by a bootstrap. CT is over successful trials. ABP: mean over the ticks in standing mode and over
-legs and waist of |torque × velocity|; in brackets with its sign. Tilt and jerk: of the carrying
-palm until 10 cm from the opening. Every figure is defined in docs/results/evaluation.md.</p>
+method; sensors with noise; success judged by the physics. Counts are out of all trials, with
+Wilson's 95% interval; means have their standard deviation and, small, the bootstrap 95% interval of
+the mean. CT is over successful trials. ABP: mean of |torque × velocity| over the control steps in
+standing mode and over legs and waist; in brackets with its sign. Tilt and jerk: of the carrying
+palm until 10 cm from the opening. Every metric is defined in docs/results/evaluation.md.</p>
 <p class="note"><b>Rows in brown are the paper's own (10 trials, human operators, a real headset;
 Tables II to IV).</b> Its rooms, points and people are not ours: compare methods within a table,
 not rows across.</p>
@@ -153,12 +154,12 @@ def write_report(
     """Write the page of a study and return its path.
 
     Args:
-        folder: Folder to write to.
+        folder: Output folder.
         cells: The study.
         found: Trials of each cell.
-        rows: The table's row of each cell.
-        results: Where the films' positions are.
-        videos: Films of each cell; the first seeds, and failures before successes after the first.
+        rows: Table row of each cell.
+        results: Store with the recorded positions.
+        videos: Videos per cell: the first trial, then failures before successes.
     """
     folder.mkdir(parents=True, exist_ok=True)
     parts = [_make_head(cells, found)]
@@ -169,7 +170,7 @@ def write_report(
         chosen = [cells[i] for i in members]
         trials = [found[i] for i in members]
         parts.append(f"<h2>{escape(f'{robot}: {place}')}</h2>")
-        # The paper's are at heights of its own.
+        # At other heights than the task's own no row of the paper matches `place`.
         parts.append(_make_table(chosen, trials, [rows[i] for i in members], robot, place))
         parts += _make_plots(folder, re.sub(r"[^\w.-]+", "-", f"{robot}-{place}"), chosen, trials)
         parts += _make_films(folder, chosen, trials, results, videos)
@@ -192,13 +193,12 @@ def _make_head(cells: Sequence[Cell], found: Sequence[Sequence[Mapping[str, Any]
     return (
         "<h1>Simulation study</h1>"
         f"<p>{count} of {wanted} trials; {sim / 60:.0f} min simulated{pace}. "
-        f"{escape(machine)}. State of the code: {escape(', '.join(codes) or 'none')}.</p>"
-        + _EXPLANATION
+        f"{escape(machine)}. Code version: {escape(', '.join(codes) or 'none')}.</p>" + _EXPLANATION
     )
 
 
 def label_cell(cell: Cell, cells: Iterable[Cell]) -> str:
-    """Method and variant, with the low-level policy where the cells have it with several."""
+    """Method and variant; with the low-level policy if the study has several for it."""
     setup = cell.setup
     label = f"{setup.method} {setup.variant}".strip()
     same = {
@@ -248,7 +248,7 @@ def _make_table(
 
 
 def _make_fields(trials: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> list[str]:
-    """Fields of a row of ours, in the order of the columns."""
+    """Fields of one of our rows, in column order."""
     count = len(trials)
     has_pickup = row["task"] == "box_pick_and_place"
     fields = [
@@ -271,7 +271,7 @@ def _make_fields(trials: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) ->
 
 
 def _make_published_fields(row: PublishedRow) -> list[str]:
-    """Fields of a row of the paper's, in the order of the columns."""
+    """Fields of one of the paper's rows, in column order."""
     fields = [
         _NOTHING if count is None else f"{count}/{PUBLISHED_TRIALS}"
         for count in (row.success, row.pickup, row.collision, None)
@@ -328,7 +328,7 @@ def _make_plots(
 
 
 def choose_trials(trials: Sequence[Mapping[str, Any]], number: int) -> list[Mapping[str, Any]]:
-    """The first trial, then failures, then the others, in the order of their seeds."""
+    """Choose the first trial, then failures, then successes, in order of seeds."""
     rest = sorted(trials[1:], key=lambda trial: (trial["success"], trial["seed"]))
     return [*trials[:1], *rest][:number]
 
@@ -359,4 +359,4 @@ def _make_films(
                 f'src="{embed(path.read_bytes(), "video/mp4")}"></video>'
                 f"<figcaption>{text}</figcaption></figure>"
             )
-    return ["<h3>Films</h3>", *parts] if parts else []
+    return ["<h3>Videos</h3>", *parts] if parts else []

@@ -1,4 +1,4 @@
-"""A study: cells of trials, what is run already, and the table that comes of it."""
+"""A study: its cells of trials, the store of results, and the table made from them."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class Cell:
     """Trials of one setup with consecutive seeds.
 
     Attributes:
-        setup: What is tried, with resolved names.
-        trials: How many trials.
-        seed: Seed of the first; the same for every method, so that all meet the same places and
-            the same person.
-        absence: Why it cannot be tried here; empty where it can.
+        setup: Setup of the trials, with resolved names.
+        trials: Number of trials.
+        seed: Seed of the first trial; the same for every method, so that all get the same scenes
+            and the same person.
+        absence: Why it cannot run here; empty if it can.
     """
 
     setup: TrialSetup
@@ -57,9 +57,9 @@ class Job:
     """One trial to run.
 
     Attributes:
-        setup: What is tried.
-        seed: Its seed.
-        folder: Folder of the results.
+        setup: Setup of the trial.
+        seed: Seed of the trial.
+        folder: Results folder.
     """
 
     setup: TrialSetup
@@ -68,16 +68,16 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Name of the trial."""
+        """Unique name of the trial."""
         return compute_key(self.setup, self.seed)
 
 
 def make_cell(setup: TrialSetup, trials: int, seed: int = 0) -> Cell:
-    """Make a cell of `setup`, whose names are checked here.
+    """Make a cell of `setup`, with resolved names.
 
     Raises:
         UnknownName: If a name is unknown, listing the known ones.
-        BadValue: If there is no trial, or the variant contradicts itself or the method.
+        BadValue: If there are no trials, or the variant contradicts itself or the method.
     """
     if trials < 1:
         raise BadValue(f"trials must be at least 1, got {trials}")
@@ -93,11 +93,11 @@ def _find_absence(low_level: str, path: str) -> str:
 
 
 def compute_key(setup: TrialSetup, seed: int) -> str:
-    """A name of the trial that changes with any of its settings."""
+    """Compute a name of the trial that changes with any of its settings."""
     plain = dataclasses.asdict(dataclasses.replace(setup, low_level_path=""))
-    if setup.low_level_path:  # where it lies tells nothing, what it holds does
+    if setup.low_level_path:  # identified by content, not by path
         plain["low_level_path"] = _digest_path(setup.low_level_path)
-    if not setup.heights:  # as trials that were run before there were any
+    if not setup.heights:  # keeps the keys of trials from before heights existed
         del plain["heights"]
     text = json.dumps(plain, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
@@ -119,7 +119,7 @@ def _digest_path(path: str) -> str:
 
 @cache
 def compute_code_digest() -> str:
-    """A name of the code of this package that changes with any of its lines."""
+    """Compute a digest of this package's code."""
     folder = Path(xop_lerobot.__file__).parent
     digest = hashlib.sha256()
     for file in sorted(folder.rglob("*.py")):
@@ -128,10 +128,10 @@ def compute_code_digest() -> str:
 
 
 class Results:
-    """What has been run, in a folder: one JSON object a line, and the films beside.
+    """Store of finished trials in a folder: one JSON object per line, positions in files beside.
 
     Args:
-        folder: The folder; made at the first trial.
+        folder: The folder; created with the first trial.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -139,10 +139,10 @@ class Results:
         self._path = folder / TRIALS_FILE
 
     def load(self) -> dict[str, dict[str, Any]]:
-        """Read the finished trials by key, of equal ones the last; errors are left out.
+        """Read the finished trials by key, the last of equal ones; failed trials are left out.
 
         Raises:
-            BadValue: If the file holds something else; names file and line.
+            BadValue: If the file is malformed; names file and line.
         """
         found = {}
         for number, record in enumerate(read_lines(self._path), 1):
@@ -153,18 +153,18 @@ class Results:
         return found
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Write one trial, so that it survives whatever comes."""
+        """Append one trial, flushed to disk."""
         append_line(self._path, json.dumps(record, allow_nan=False))
 
     def film_path(self, key: str) -> Path:
-        """File of the positions of the trial `key`."""
+        """Return the file of the positions of the trial `key`."""
         return self.folder / FILMS_FOLDER / f"{key}.npz"
 
 
 def plan_jobs(cells: Sequence[Cell], folder: Path, finished: Iterable[str]) -> list[Job]:
-    """List the trials that are still to be run, methods in turn within each seed.
+    """List the trials still to run, alternating methods within each seed.
 
-    So an interrupted study is balanced: all methods have met the same seeds, give or take one.
+    So an interrupted study is balanced: all methods have run the same seeds, up to one.
     """
     done = set(finished)
     jobs: dict[str, Job] = {}
@@ -178,7 +178,7 @@ def plan_jobs(cells: Sequence[Cell], folder: Path, finished: Iterable[str]) -> l
 
 
 def run_job(job: Job) -> dict[str, Any]:
-    """Run one trial, and keep its film in the folder; workers call this."""
+    """Run one trial and save its positions in the folder; called by the workers."""
     trial = run_trial(job.setup, job.seed)
     path = Results(Path(job.folder)).film_path(job.key)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -203,14 +203,14 @@ def run_study(
     run: Callable[[Job], dict[str, Any]] = run_job,
     jobs: Sequence[Job] | None = None,
 ) -> Generator[JobResult]:
-    """Run what is still to be run, writing each trial down before it is yielded.
+    """Run the missing trials, saving each before it is yielded.
 
     Args:
         cells: The study.
-        results: Where trials are kept; what is there already is not run again.
+        results: Store of trials; those in it are not repeated.
         workers: Number of processes.
-        run: What runs a job; a function of a module.
-        jobs: What is to be run, where it is known already.
+        run: Function that runs a job; it must be importable by the workers.
+        jobs: Trials to run, if already known.
     """
     if jobs is None:
         jobs = plan_jobs(cells, results.folder, results.load())
@@ -225,7 +225,7 @@ def run_study(
 
 
 def collect(cell: Cell, records: Mapping[str, Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Trials of a cell that were run, in the order of their seeds."""
+    """Return the finished trials of a cell, in order of seeds."""
     keys = (compute_key(cell.setup, seed) for seed in cell.seeds) if not cell.absence else ()
     return [records[key] for key in keys if key in records]
 
@@ -233,7 +233,7 @@ def collect(cell: Cell, records: Mapping[str, Mapping[str, Any]]) -> list[Mappin
 def summarise(cell: Cell, trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Make one row of the table: counts out of `trials`, means and standard deviations.
 
-    CT is over the successful trials, everything else over all. What has no value is None.
+    CT is over successful trials, everything else over all. A missing value is None.
     """
     setup = cell.setup
 
@@ -281,7 +281,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _std(values: Sequence[float]) -> float | None:
-    """Standard deviation of the values themselves, as the paper's of one trial is 0.00."""
+    """Population standard deviation: the paper's of one trial is 0.00."""
     return float(np.std(values)) if values else None
 
 
@@ -294,13 +294,13 @@ def load_study(path: Path, overrides: Mapping[str, Any] | None = None) -> list[C
     """Read the cells of a study.
 
     Args:
-        path: YAML file: `trials`, `seed`, `noise`, `fps`, `time_limit`, `low_level_paths` (file
-            or folder of a low-level policy by its name), and a list of `groups`; each has a
-            `robot` and lists of `tasks` and `methods`, and may have lists of `variants` and
-            `low_levels`, and `trials`, `noise`, `scene` and `heights` of its own. Every combination
+        path: YAML file with `trials`, `seed`, `noise`, `fps`, `time_limit`, `low_level_paths` (file
+            or folder by name of a low-level policy), and a list of `groups`. Each group has a
+            `robot` and lists of `tasks` and `methods`; optional are lists of `variants` and
+            `low_levels`, and its own `trials`, `noise`, `scene` and `heights`. Every combination
             within a group is a cell.
-        overrides: Values over those of the file and of all its groups (`trials`, `seed`,
-            `noise`, …); None leaves a value.
+        overrides: Values that replace those of the file and of all its groups (`trials`, `seed`,
+            `noise`, …); None keeps a value.
 
     Raises:
         BadValue: If the file is missing or malformed.
@@ -330,10 +330,9 @@ def load_study(path: Path, overrides: Mapping[str, Any] | None = None) -> list[C
 
 
 def make_cells(group: Mapping[str, Any]) -> list[Cell]:
-    """Make a cell of every combination of tasks, low-level policies, methods and variants.
+    """Make a cell for every combination of tasks, low-level policies, methods and variants.
 
-    A method that always has the same low-level policy comes once, whatever policies are asked
-    for.
+    A method with a fixed low-level policy appears once, whatever policies are requested.
 
     Raises:
         UnknownName: If a name is unknown, listing the known ones.

@@ -1,4 +1,4 @@
-"""Figures of one recorded episode, computed from the dataset's own columns, and their table."""
+"""Metrics of one recorded episode from its columns, their table, and confidence intervals."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ if TYPE_CHECKING:
     from xop_lerobot.morphology.morphology import Morphology
 
 END_S = 0.5
-"""The error "at the end" is the mean over this last part of the engaged time [s]."""
+"""Last part of the engaged time over which the error "at the end" is averaged [s]."""
 HEALTH = "retargeter.health"
 SOLVE_TIME = "solve_time"
 
 
 @dataclass(frozen=True)
 class EpisodeSummary:
-    """Figures of one episode.
+    """Metrics of one episode.
 
     Attributes:
         robot: Name of the robot.
-        frames: Frames in the episode.
-        duration_s: Their time, frames over fps [s].
-        engaged_s: Time in which the operator drove [s].
+        frames: Number of frames.
+        duration_s: Duration, frames over fps [s].
+        engaged_s: Time in which the operator was engaged [s].
         head_error_mean: Mean distance of `robot.head` from `goal.head` while engaged [m].
-        head_error_end: Mean of it over the last `END_S` of the engaged time [m].
-        falls: How often the robot fell.
+        head_error_end: Mean distance over the last `END_S` of the engaged time [m].
+        falls: Number of falls.
         plan_ms_median: Median solve time of the retargeter [ms]; 0 if it never solved.
-        plan_ms_p99: 99th percentile of it [ms].
+        plan_ms_p99: 99th percentile of the solve time [ms].
     """
 
     robot: str
@@ -56,17 +56,17 @@ def compute_episode_summary(
     robot: str,
     morphology: Morphology,
 ) -> EpisodeSummary:
-    """Compute the figures of one episode.
+    """Compute the metrics of one episode.
 
     Args:
-        columns: The episode's columns by key, one row a frame.
+        columns: The episode's columns by key, one row per frame.
         health_names: Names of the entries of `retargeter.health`.
-        fps: Frames per second.
+        fps: Frame rate [Hz].
         robot: Name for the table.
-        morphology: The robot, for the bounds of a fall.
+        morphology: The robot, for the limits that define a fall.
 
     Raises:
-        UnknownName: If a column or the solve time is missing; lists what there is.
+        UnknownName: If a column or the solve time is missing; lists the available ones.
         BadValue: If the operator never engaged.
     """
     engaged = np.asarray(_get_column(columns, "operator.engaged")).reshape(-1).astype(bool)
@@ -101,7 +101,7 @@ def read_columns(dataset: Any, episode: int = 0) -> dict[str, np.ndarray]:
     """Read the one-dimensional columns of an episode of a `LeRobotDataset`.
 
     Args:
-        dataset: A `lerobot.datasets.LeRobotDataset`; its videos are not decoded.
+        dataset: A `lerobot.datasets.LeRobotDataset`; videos are not decoded.
         episode: Index of the episode.
 
     Returns:
@@ -127,7 +127,7 @@ def read_columns(dataset: Any, episode: int = 0) -> dict[str, np.ndarray]:
 
 
 def format_summaries(summaries: Sequence[EpisodeSummary]) -> str:
-    """Lay the figures out as a table for a terminal, one row an episode."""
+    """Format the metrics as a table for a terminal, one row per episode."""
     header = (
         *("robot", "frames", "duration [s]", "engaged [s]", "head error mean [m]"),
         *("at the end [m]", "falls", "plan median [ms]", "plan p99 [ms]"),
@@ -157,7 +157,7 @@ def _get_column(columns: Mapping[str, np.ndarray], key: str) -> np.ndarray:
 
 
 class Interval(NamedTuple):
-    """Where a figure lies with 95% confidence.
+    """95% confidence interval of a metric.
 
     Attributes:
         low: Lower end.
@@ -169,14 +169,15 @@ class Interval(NamedTuple):
 
 
 def compute_rate_interval(count: int, trials: int) -> Interval:
-    r"""Compute Wilson's score interval of a rate, 95%.
+    r"""Compute Wilson's 95% score interval of a rate.
 
     .. math:: \frac{\hat p + z^2/2n \pm z\sqrt{\hat p(1-\hat p)/n + z^2/4n^2}}{1 + z^2/n}
 
-    It is sound for few trials and for rates of 0 and 1, where the normal one has no width.
+    It is valid for few trials and for rates of 0 and 1, where the normal approximation has zero
+    width.
 
     Raises:
-        BadValue: If `count` is not between 0 and `trials`, or there is no trial.
+        BadValue: If `count` is not between 0 and `trials`, or there are no trials.
     """
     if not 0 <= count <= trials or trials < 1:
         raise BadValue(f"a rate needs 0 <= count <= trials and a trial, got {count} of {trials}")
@@ -185,14 +186,14 @@ def compute_rate_interval(count: int, trials: int) -> Interval:
 
 
 def compute_mean_interval(values: Sequence[float], seed: int = 0) -> Interval:
-    """Compute the bootstrap interval of a mean, 95%, percentile, 2000 draws.
+    """Compute the 95% percentile bootstrap interval of a mean, with 2000 resamples.
 
     Args:
-        values: Values; those that are not finite do not count.
-        seed: Seed of the draws.
+        values: Values; non-finite ones are ignored.
+        seed: Seed of the resampling.
 
     Returns:
-        The interval; nan without a value, and of no width with one alone.
+        The interval; nan without values, of zero width for a single one.
     """
     known = np.asarray([value for value in values if np.isfinite(value)], float)
     if known.size == 0:

@@ -1,7 +1,7 @@
-"""One closed-loop episode: a simulated person does a task with a robot, in lock-step.
+"""One closed-loop trial: a simulated person performs a task with a robot, in lock-step.
 
-All of teleoperation is in the loop, from the person's eyes to the motors, as in LeRobot's own
-loop but without LeRobot: nothing waits, nothing is recorded, and the same seed is the same trial.
+The loop contains all of teleoperation, from the person's eyes to the motors, like LeRobot's own
+loop but without LeRobot: it never waits and records nothing, and equal seeds give equal trials.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ if TYPE_CHECKING:
     from xop_lerobot.tasks.stage import Stage
 
 GRACE_S = 5.0
-"""How far over its task's time limit an episode may run before it is cut off [s]."""
+"""Time over its task's limit after which an episode is aborted [s]."""
 FILM_HZ = 25
-"""Most pictures per second of a film [Hz]."""
+"""Highest rate of recorded positions [Hz]."""
 
 
 @dataclass(frozen=True)
 class TrialSetup:
-    """Configuration of a trial, except the seed.
+    """Setup of a trial, except for the seed.
 
     Attributes:
         robot: Name of the robot.
         task: Name of the task.
         method: Name of the method.
-        variant: Variant of it; see `parse_variant`.
+        variant: Variant of the method; see `parse_variant`.
         low_level: Low-level policy; empty for the robot's own.
         low_level_path: Its file; empty for its default.
-        noise: Preset of the sensors' noise.
+        noise: Preset of the sensor noise.
         scene: Scene; empty for the task's own.
-        heights: Heights over the task's usual ones; see `Task.choose_heights`.
+        heights: Heights that override the task's defaults; see `Task.choose_heights`.
         fps: Rate of the control loop [Hz].
-        time_limit: Time after which the episode is cut off, if its task has not ended it [s];
-            0 for the task's own limit.
+        time_limit: Time after which the episode is aborted, if its task has not ended it [s]; 0 for
+            the task's own limit.
     """
 
     robot: str
@@ -71,7 +71,7 @@ class TrialSetup:
 
     @property
     def place(self) -> str:
-        """The task, with its heights if they are not the default, in words."""
+        """The task, with its heights if not the default."""
         return f"{self.task} {self.heights}".strip()
 
     @property
@@ -95,24 +95,24 @@ class TrialSetup:
 
 @dataclass(frozen=True)
 class Trace:
-    """True trajectory of a trial, tick by tick. n ticks.
+    """True trajectory of a trial, with n control steps (ticks).
 
     Attributes:
-        time: Robot's clock [s]. Shape (n,).
-        engaged: Whether the person drives. Shape (n,), bool.
-        mode: Mode that the robot is in. Shape (n,).
+        time: Robot clock [s]. Shape (n,).
+        engaged: Whether the person is engaged. Shape (n,), bool.
+        mode: Mode of the robot. Shape (n,).
         qpos: Generalised position of the robot. Shape (n, nq).
         qvel: Generalised velocity. Shape (n, nv).
         effort: Actuator forces [N m or N]. Shape (n, nu).
-        command: Command that is executed from this tick on. Shape (n, k).
+        command: Command executed from this tick on. Shape (n, k).
         frames: Poses of head, wrists and palms. Shapes (n, 7).
-        goals: Goals of head and wrists, nan where there are none. Shapes (n, 7).
-        objects: Poses of what the task put into the scene. Shapes (n, 7).
+        goals: Goals of head and wrists, nan if there are none. Shapes (n, 7).
+        objects: Poses of the task's objects. Shapes (n, 7).
         fallen: Whether the robot has fallen. Shape (n,), bool.
-        collision: Whether it touched anything but the ground in the tick. Shape (n,), bool.
+        collision: Whether it touched anything but the ground during the tick. Shape (n,), bool.
         solve_s: Duration of each solve of the retargeter [s]. Shape (m,).
-        failed: Whether each solve had no sample of finite cost. Shape (m,), bool.
-        intervened: Whether the retargeter slowed or vetoed each plan. Shape (m,), bool.
+        failed: Whether no sample of the solve had finite cost. Shape (m,), bool.
+        intervened: Whether the retargeter slowed or vetoed the plan. Shape (m,), bool.
     """
 
     time: np.ndarray
@@ -134,12 +134,12 @@ class Trace:
 
 @dataclass(frozen=True)
 class Film:
-    """Positions of everything in the scene, to render images later.
+    """Recorded positions of the whole scene, from which images are rendered later.
 
     Attributes:
-        fps: Pictures per second [Hz].
+        fps: Frame rate [Hz].
         qpos: Positions of robot and objects. Shape (p, nq of the scene), float32.
-        mocap_pos: Places of the furniture. Shape (p, m, 3), float32.
+        mocap_pos: Positions of the furniture. Shape (p, m, 3), float32.
         mocap_quat: Orientations of the furniture, wxyz. Shape (p, m, 4), float32.
     """
 
@@ -151,18 +151,18 @@ class Film:
 
 @dataclass(frozen=True)
 class Trial:
-    """One episode.
+    """Result of one trial.
 
     Attributes:
-        setup: What was tried, with resolved names.
-        seed: Its seed: of placement, person, sensors and samples.
-        status: How it ended.
-        completion_s: Time from the person's first engaging to success, nan without it [s].
-        sim_s: Length of the episode after settling [s].
-        wall_s: Time that it took on this machine [s].
+        setup: Setup, with resolved names.
+        seed: Seed of placement, person, sensors and samples.
+        status: Final status of the task.
+        completion_s: Time from the first engagement to success, nan without success [s].
+        sim_s: Simulated duration after settling [s].
+        wall_s: Computing time on this machine [s].
         fallen: Whether the robot fell.
-        trace: What happened.
-        film: For pictures.
+        trace: Trajectory.
+        film: Positions for rendering.
     """
 
     setup: TrialSetup
@@ -177,23 +177,23 @@ class Trial:
 
     @property
     def dt(self) -> float:
-        """Time between ticks [s]."""
+        """Control period [s]."""
         return 1 / self.setup.fps
 
 
 @dataclass
 class TraceRows:
-    """Collects ticks of a closed loop."""
+    """Collects the ticks of a closed loop."""
 
     ticks: list[dict[str, Any]] = field(default_factory=list)
     solves: list[tuple[float, bool, bool]] = field(default_factory=list)
 
     def add(self, tick: Tick, command: np.ndarray) -> None:
-        """Add one tick; without a view, a trace has no frames and objects.
+        """Add one tick; without a view, the trace has no frames and objects.
 
         Args:
-            tick: The tick, decided.
-            command: What is executed of its command. Shape (k,).
+            tick: The tick, after the decision.
+            command: Its command after limits. Shape (k,).
         """
         state, view = tick.state, tick.view
         goals = tick.goal.poses if tick.goal is not None else {}
@@ -220,7 +220,7 @@ class TraceRows:
             self.solves.append((health.get("solve_time", 0.0), failed != Status.OK, intervened > 0))
 
     def make_trace(self) -> Trace:
-        """Stack the ticks."""
+        """Stack the ticks into arrays."""
         columns: dict[str, Any] = {}
         for name, first in self.ticks[0].items():
             values = [tick[name] for tick in self.ticks]
@@ -235,7 +235,7 @@ class TraceRows:
 
 
 class _Filming:
-    """Records the positions of the whole scene, at most 25 times a second."""
+    """Records the positions of the whole scene, at most at `FILM_HZ`."""
 
     def __init__(self, stage: Stage, fps: int) -> None:
         self._data = stage.plant.data
@@ -257,12 +257,12 @@ class _Filming:
         self._count += 1
 
     def make_film(self) -> Film:
-        """Stack the positions."""
+        """Stack the positions into arrays."""
         return Film(self.fps, *(np.stack(column) for column in zip(*self._rows, strict=True)))
 
 
 def make_stage(setup: TrialSetup, seed: int) -> Stage:
-    """Make robot, scene and task of a resolved `setup`."""
+    """Build robot, scene and task of a resolved `setup`."""
     from xop_lerobot.tasks.stage import Stage  # noqa: PLC0415
 
     config = SimulationConfig(scene=setup.scene, noise=setup.noise, seed=seed)
@@ -280,7 +280,10 @@ def closed_loop(
     seed: int = 0,
     realtime: bool = False,
 ) -> Iterator[tuple[PolicyLoop, Teleoperation]]:
-    """Make a teleoperation that drives a simulated robot; a tick is `step`, then `execute`."""
+    """Yield a policy loop and the teleoperation that drives it.
+
+    One tick is `Teleoperation.step`, then `PolicyLoop.execute`.
+    """
     morphology, path = plant.morphology, low_level_path or None
     name, scene = resolve_policy(morphology, low_level), plant.config.scene
     info = RobotInfo(morphology.name, morphology, name, path, scene, fps, seed, realtime)
@@ -298,16 +301,16 @@ def run_trial(
     seed: int,
     watch: Callable[[Stage, View, Tick], None] | None = None,
 ) -> Trial:
-    """Run one episode.
+    """Run one trial.
 
     Args:
-        setup: What is tried.
+        setup: Its setup.
         seed: Seed of placement, person, sensors and samples.
-        watch: Called once a tick, before time passes; for pictures and debugging.
+        watch: Called once per tick, before the simulation advances; for rendering and debugging.
 
     Raises:
         UnknownName: If a name in `setup` is unknown.
-        PolicyFileError: If the low-level policy's file is not there.
+        PolicyFileError: If the low-level policy's file is missing.
     """
     begin = perf_counter()
     setup = setup.resolved
@@ -337,7 +340,7 @@ def _drive(
     begin: float,
     watch: Callable[[Stage, View, Tick], None] | None,
 ) -> Trial:
-    """Close the loop until the task is over."""
+    """Run the closed loop until the task is over."""
     rows, filming = TraceRows(), _Filming(stage, setup.fps)
     dt, start = 1 / setup.fps, loop.state.time
     limit = setup.time_limit or TASKS[setup.task].time_limit + GRACE_S

@@ -1,4 +1,4 @@
-"""The figures of one trial: which ticks and which joints each of the paper's formulas is fed."""
+"""Metrics of one trial: which ticks and joints enter each of the paper's formulas."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
 
 TOUCH = 0.05
-"""Distance at which a palm touches its point, in the paper [m]."""
+"""Distance at which a palm touches its point, as in the paper [m]."""
 RELEASE_RADIUS = 0.10
-"""Horizontal distance from the opening within which what is carried is being released [m]."""
+"""Horizontal distance from the opening within which a carried object is being released [m]."""
 LOST_DISTANCE = 0.08
-"""How much further from the palm than at first an object is when it has left it [m]."""
+"""Increase of an object's distance from the palm from which it has left the palm [m]."""
 TRACE_DT = 0.2
-"""Time between the points of what is kept for plots [s]."""
+"""Time step of the data kept for plots [s]."""
 
 
 def compute_metrics(trial: Trial) -> dict[str, float]:
-    """Compute the figures of a trial; what nothing contributed to is nan.
+    """Compute the metrics of a trial; nan for metrics without samples.
 
     Returns:
         ``abp`` and ``abp_signed`` [W]; ``tilt`` [rad] and ``jerk`` [m/s³] of the carrying palm
-        before the release, where something is carried on it, else ``jerk`` of both palms;
-        ``head_error``, ``hands_error`` [m], their ``_p95`` and ``head_angle`` [rad];
-        ``roughness`` of the commands [1/s²]; ``slip`` of bearing feet [m/s]; ``standing``, the
-        share of time in standing mode; ``plan_ms`` and ``plan_p99_ms``; ``touch_s``, the longest
-        time for which both palms were within 5 cm of their points [s].
+        before the release, if something is carried on it, else ``jerk`` of both palms;
+        ``head_error``, ``hands_error`` [m], their ``_p95`` and ``head_angle`` [rad]; ``roughness``
+        of the commands [1/s²]; ``slip`` of feet in contact [m/s]; ``standing``, the share of time
+        in standing mode; ``plan_ms`` and ``plan_p99_ms``; ``touch_s``, the longest time for which
+        both palms were within 5 cm of their points [s].
     """
     morphology = make_morphology(trial.setup.robot)
     trace, dt = trial.trace, trial.dt
@@ -77,13 +77,13 @@ def compute_metrics(trial: Trial) -> dict[str, float]:
 
 
 def find_lower_body(morphology: Morphology) -> tuple[np.ndarray, np.ndarray]:
-    """Find the driven joints that carry the robot: legs (or wheels) and waist (or torso).
+    """Find the actuated joints that support the robot: legs (or wheels) and waist (or torso).
 
-    These are all on the way from the base to a contact point or to a hand that are no joints of
-    an arm: for G1 twelve of the legs and three of the waist.
+    These are the joints between the base and a contact point or a hand, other than arm joints: for
+    G1 twelve of the legs and three of the waist.
 
     Returns:
-        Actuators, and the degree of freedom of each. Shapes (m,).
+        Actuators, and their degrees of freedom. Shapes (m,).
     """
     model = morphology.build_spec("planning").compile()
     sites = (*morphology.contact_points, *(morphology.frames[arm.frame] for arm in morphology.arms))
@@ -110,17 +110,17 @@ def find_transport(
 ) -> tuple[str, np.ndarray] | None:
     """Find the palm that carries an object to an opening, and the ticks before the release.
 
-    Transport begins when the object lies free on the palm. The release begins as soon as it is
-    within 10 cm of the opening, seen from above, or has left the palm; whatever the method, and
-    whether or not it falls in.
+    Transport starts when the object lies free on the palm. The release starts when it is within 10
+    cm of the opening, seen from above, or has left the palm; for every method, and whether or not
+    it falls in.
 
     Args:
-        trace: What happened.
-        figures: The task's own: `free_time_s`, when the object was no longer held, if it was,
-            and `let_go_time_s`, when it left the palm [s].
+        trace: Trajectory of the trial.
+        figures: Results of the task: `free_time_s`, when the object was no longer held, and
+            `let_go_time_s`, when it left the palm [s]; both optional.
 
     Returns:
-        Frame of the palm and the ticks, shape (n,); None where nothing is carried to an opening.
+        Frame of the palm, and the ticks of shape (n,); None if nothing is carried to an opening.
     """
     if "toy" not in trace.objects or "opening" not in trace.objects:
         return None
@@ -149,7 +149,7 @@ def _compute_palm_metrics(trial: Trial) -> dict[str, float]:
         ]
         return {"tilt": math.nan, "jerk": float(np.mean(jerks))}
     palm, ticks = transport
-    wrist = palm.replace("palm", "wrist")  # its Z is what points out of the back of the hand
+    wrist = palm.replace("palm", "wrist")  # `compute_tilt` is about the wrist's Z axis
     return {
         "tilt": compute_tilt(trace.frames[wrist][:, 3:], ticks),
         "jerk": compute_jerk(trace.frames[palm][:, :3], dt, ticks),
@@ -157,7 +157,7 @@ def _compute_palm_metrics(trial: Trial) -> dict[str, float]:
 
 
 def compute_feet(morphology: Morphology, qpos: np.ndarray) -> np.ndarray:
-    """Find the middle of each foot or wheel. Shape (n, nq) -> (n, f, 3)."""
+    """Compute the middle of each foot or wheel. Shape (n, nq) -> (n, f, 3)."""
     model, groups = build_model(morphology, "planning"), morphology.contact_groups
     points = tuple(point for group in groups for point in group)
     poses = SiteKinematics(model, points).compute_poses(qpos)
@@ -177,7 +177,7 @@ def _compute_touch(trace: Trace, dt: float) -> float:
 
 
 def make_plot_trace(trial: Trial) -> dict[str, Any]:
-    """Keep what plots show: the head's way and goal, and the errors of head and hands."""
+    """Extract the data for plots: path of the head, and errors of head and hands."""
     trace = trial.trace
     step = max(1, round(TRACE_DT * trial.setup.fps))
     rows = slice(None, None, step)
@@ -196,7 +196,7 @@ def make_plot_trace(trial: Trial) -> dict[str, Any]:
 
 
 def make_record(trial: Trial) -> dict[str, Any]:
-    """Put settings, outcome and figures of a trial in one place, fit for JSON."""
+    """Collect settings, outcome and metrics of a trial, as plain values for JSON."""
     status = trial.status
     figures = {**compute_metrics(trial), **{f"task_{k}": v for k, v in status.figures.items()}}
     return {
