@@ -1,8 +1,8 @@
-"""Where the robot and the teleoperator of one process meet, keyed by session.
+"""Session: where the robot and the teleoperator of one process exchange data.
 
-LeRobot's loops hand the teleoperator no observation, and connect the two in either order.
-So the robot publishes here what it is (`announce`) and, in every `get_observation`, begins a
-`Tick` (`begin_tick`). Teleoperator and robot add to that tick what they do in it (`put`), and the
+LeRobot's loops pass the teleoperator no observation, and connect the two devices in either order.
+So the robot publishes its description here (`announce`) and, in every `get_observation`, starts a
+`Tick` (`begin_tick`). Teleoperator and robot add their results to that tick (`put`), and the
 recorder reads it. Publishing replaces one immutable value, so readers need no lock.
 """
 
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RobotInfo:
-    """What a teleoperator must know of its robot.
+    """Description of a robot for its teleoperator.
 
     Attributes:
         name: LeRobot's robot type, ``"xop_g1"``.
         morphology: The robot's morphology.
         low_level: Name of its low-level policy.
         low_level_path: File of that policy, None for its default.
-        scene: Name of the scene it stands in.
+        scene: Name of its scene.
         fps: Rate of the control loop [Hz].
         seed: Seed of its session.
         realtime: Whether its clock is the wall clock.
-        has_truth: Whether its states hold the true position beside the measured one, as only a
+        has_truth: Whether its states contain the true position besides the measured one, as only a
             simulation's can.
-        cameras: Height, width and channels of each camera's pictures, by its name.
+        cameras: Image height, width and channels by camera name.
     """
 
     name: str
@@ -59,16 +59,16 @@ class RobotInfo:
 
 @dataclass(frozen=True)
 class TaskStatus:
-    """Status of an episode's task, decided by the physics alone.
+    """Status of an episode's task, judged by the physics alone.
 
     Attributes:
         success: Whether the task is accomplished.
-        done: Whether the episode is over, with success or without.
-        failure: Why the episode is lost, in words; empty while it is not.
-        picked_up: Whether the object was held up for long enough.
-        figures: Further figures of the episode by name, fit for JSON.
-        collisions: What of the robot touched which wall or piece of furniture so far, other than
-            the hands where the task is for them to.
+        done: Whether the episode is over, successful or not.
+        failure: Why the episode failed; empty while it has not.
+        picked_up: Whether the object was held up for the required time.
+        figures: Further metrics of the episode by name, as plain values for JSON.
+        collisions: Pairs of robot part and touched wall or furniture so far, except hands on what
+            the task has them handle.
     """
 
     success: bool
@@ -81,7 +81,7 @@ class TaskStatus:
 
 @dataclass(frozen=True)
 class Tick:
-    """One control step, from the measurement to its outcome; grows by a stage at a time.
+    """One control step, from the measurement to its outcome; each stage adds its fields.
 
     1. *Observed* by the robot in `get_observation`: `state`, `view`, `pictures`,
        `proprioception`, and `outcome` as it is before the action.
@@ -90,26 +90,25 @@ class Tick:
     3. *Executed* by the robot in `send_action`: `executed`, and `outcome` after the action.
     4. Read by the recorder in `add_frame`.
 
-    A stage that comes again in the same tick replaces what it wrote before.
+    A stage that is repeated within a tick overwrites its fields.
 
     Attributes:
-        state: The robot state that the tick starts from, as measured.
-        view: What a person could see of the robot and its task, None where no task runs.
-        pictures: What the robot's cameras see, by name. Shapes (height, width, 3), uint8.
-        proprioception: The robot's observation without pictures, by key.
+        state: Measured robot state at the start of the tick.
+        view: What a person could see of the robot and its task, None without a task.
+        pictures: Camera images by name. Shapes (height, width, 3), uint8.
+        proprioception: The robot's observation without images, by key.
         frame: The operator's frame, None before the first.
         goal: The goal, None while not engaged.
-        command: The retargeter's command a*, before limits; None until it is decided. Shape (k,).
-        cost: Cost of the plan by term.
-        health: Figures on the plan's health by name (solve time, age, effective samples, …).
-        finished: Whether the device has played out.
-        estimate: Position that the tick was planned from, where the measured one was put in
-            accordance with the ground first; None where it was not. Shape (nq,).
-        settings: What was in force in the tick (preset, weights, targets, mode, …).
-        changes: What came into force at its beginning.
-        executed: What the robot executes, limits applied, by action key; None until it is sent
-            an action.
-        outcome: Status of the task, None where no task runs.
+        command: The retargeter's command a* before limits; None until decided. Shape (k,).
+        cost: Plan cost by term.
+        health: Health metrics of the plan by name (solve time, age, effective samples, …).
+        finished: Whether the device has played to its end.
+        estimate: Position that the tick was planned from, if the measured one was first made
+            consistent with the ground contacts; None otherwise. Shape (nq,).
+        settings: Settings of the tick (preset, weights, targets, mode, …).
+        changes: Changes of settings that took effect at its start.
+        executed: Action after limits, by key; None until an action is sent.
+        outcome: Status of the task, None without a task.
     """
 
     state: RobotState
@@ -132,38 +131,38 @@ class Tick:
 
     @property
     def engaged(self) -> bool:
-        """Whether the operator drives."""
+        """Whether an operator is engaged."""
         return self.goal is not None
 
 
 class Recorder(Protocol):
-    """Who records the session."""
+    """Interface of the recorder of a session."""
 
     def grant(self, request: RecordingRequest) -> tuple[Cue, str]:
-        """Do what the operator asks for; return what the operator is told."""
+        """Fulfil the operator's request; return the notice for the operator."""
         ...
 
     def pause(self, events: MutableMapping[str, bool]) -> None:
-        """Take note that the pause after an episode begins, with the events of its loop."""
+        """Start the pause after an episode, with the events of its loop."""
         ...
 
     def forget_presses(self) -> None:
-        """Forget the keys that were pressed before the robot stood ready for the episode."""
+        """Discard key presses from before the robot was ready for the episode."""
         ...
 
 
 class Session:
-    """One robot and one teleoperator.
+    """Shared state of one robot and one teleoperator.
 
     Attributes:
         name: The session's name.
-        tick: The present tick, None before the robot's first observation and after a reset.
-        obstacles: Walls and furniture of the episode, None where no task places any.
-        episode: Index of the episode being recorded; the robot's seed depends on it.
-        reset_count: Number of robot resets so far; a change tells the teleoperator to re-align.
-        progress: How far the recording is, None where nothing is recorded.
-        recorder: Who records, None where nobody does.
-        configs: Resolved configuration of each part (`robot`, `teleop`), saved with a dataset.
+        tick: Current tick, None before the robot's first observation and after a reset.
+        obstacles: Walls and furniture of the episode, None if no task places any.
+        episode: Index of the episode being recorded; seeds the robot's episode.
+        reset_count: Number of robot resets; a change tells the teleoperator to align again.
+        progress: Progress of the recording, None without one.
+        recorder: The recorder, None without one.
+        configs: Resolved configuration of each part (`robot`, `teleop`), stored with a dataset.
     """
 
     def __init__(self, name: str) -> None:
@@ -186,7 +185,7 @@ class Session:
                 self._robots.append(info)
 
     def withdraw(self, info: RobotInfo) -> None:
-        """Take the robot `info` out of the session; unknown ones are ignored."""
+        """Remove the robot `info` from the session; unknown ones are ignored."""
         with self._lock:
             self._robots = [known for known in self._robots if known is not info]
             if not self._robots:
@@ -195,39 +194,39 @@ class Session:
                 self.progress = self.recorder = None
 
     def begin_episode(self, index: int) -> None:
-        """Ask the robot to start over as episode `index`, in its next `get_observation`."""
+        """Request a reset of the robot for episode `index`, in its next `get_observation`."""
         self.episode = index
         self._reset_asked = True
 
     def take_reset(self) -> bool:
-        """Whether a reset was asked for since the last call; the robot alone calls this."""
+        """Whether a reset was requested since the last call; called by the robot only."""
         asked, self._reset_asked = self._reset_asked, False
         return asked
 
     def confirm_reset(self) -> None:
-        """Count a reset that the robot has done, and forget what was before it."""
+        """Count a finished reset of the robot, and discard the state from before."""
         self._forget()
         self.reset_count += 1
         if self.recorder is not None:
             self.recorder.forget_presses()
 
     def begin_tick(self, tick: Tick) -> None:
-        """Publish an observation as the beginning of a tick; the robot alone calls this."""
+        """Publish an observation as the start of a tick; called by the robot only."""
         with self._lock:
             self.tick = tick
 
     def put(self, tick: Tick) -> None:
-        """Publish `tick` with one stage more.
+        """Publish `tick` with one more stage.
 
-        Nothing happens if it is not the present one any more, because the robot was observed or
-        reset meanwhile: its stages must not mix with those of another tick.
+        A tick that is no longer the current one, because the robot was observed or reset meanwhile,
+        is ignored: its stages must not mix with those of another tick.
         """
         with self._lock:
             if self.tick is not None and self.tick.state is tick.state:
                 self.tick = tick
 
     def ask(self, request: RecordingRequest) -> tuple[Cue, str]:
-        """Put `request` to the recorder; return what the operator is told."""
+        """Pass `request` to the recorder; return the notice for the operator."""
         if self.recorder is None:
             return Cue.REFUSED, "Nothing is recorded."
         return self.recorder.grant(request)
@@ -261,6 +260,6 @@ _SESSIONS_LOCK = Lock()
 
 
 def get_session(name: str = "default") -> Session:
-    """Return the session `name`, made on first use."""
+    """Return the session `name`, created on first use."""
     with _SESSIONS_LOCK:
         return _SESSIONS.setdefault(name, Session(name))

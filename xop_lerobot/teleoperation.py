@@ -1,4 +1,4 @@
-"""From the operator to the robot: device, alignment, retargeter and arm kinematics in one."""
+"""Teleoperation: from the operator's device to the robot's action, in one object."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ from xop_lerobot.session import RobotInfo, Tick
 
 @dataclass
 class TeleoperationConfig:
-    """What a teleoperation is made of.
+    """Configuration of a teleoperation.
 
     Attributes:
-        device: Where the operator's motion comes from.
-        alignment: How it is laid on the robot.
-        retargeter: How goals become commands.
-        gestures: What the operator's pinches do.
+        device: Source of the operator's motion.
+        alignment: Mapping from the operator to the robot.
+        retargeter: Mapping from goals to commands.
+        gestures: Meaning of the operator's pinches.
     """
 
     device: DeviceConfig = field(default_factory=DeviceConfig)
@@ -62,15 +62,14 @@ class TeleoperationConfig:
 
 
 class Teleoperation:
-    """One operator drives one robot: `step` turns a robot state into an action.
+    """One operator driving one robot: `step` turns a robot state into an action.
 
-    While nobody is engaged (`Engagement`), the robot is asked to hold the posture it is in; the
-    next engagement aligns anew, so no command ever makes a step. `change` changes settings
-    meanwhile. What the operator asks of the recording is there in `take_requests`, and the answer
-    is given with `answer`.
+    While no operator is engaged (`Engagement`), the robot holds its posture; the next engagement
+    aligns again, so no command ever jumps. `change` changes settings at runtime. Requests of the
+    operator to the recorder are returned by `take_requests` and answered by `answer`.
 
     Args:
-        config: Its parts.
+        config: Configuration.
         info: The robot.
     """
 
@@ -131,19 +130,19 @@ class Teleoperation:
         self.device.connect()
 
     def disconnect(self) -> None:
-        """Close the device and stop the threads; may be called twice."""
+        """Close the device and stop all threads; may be called twice."""
         self.device.disconnect()
         self._follower.close()
 
     def reset(
         self, obstacles: tuple[Obstacle, ...] | None = None, episode: int | None = None
     ) -> None:
-        """Start over, as after a reset of the robot: nobody is engaged, no plan is known.
+        """Start over after a reset of the robot: disengaged, without a plan.
 
         Args:
-            obstacles: What stands around the robot now, beside those of the retargeter's own
-                file; None where that has not changed.
-            episode: Which episode of a session begins; None where there are none.
+            obstacles: Obstacles around the robot, besides those of the retargeter's own file; None
+                if unchanged.
+            episode: Index of the episode that starts; None outside of episodes.
         """
         if obstacles is not None:
             config, scene = self.config.retargeter, self.info.scene
@@ -155,32 +154,32 @@ class Teleoperation:
         self._start_over()
 
     def change(self, change: Change | Mapping[str, Any], source: str = "call") -> dict[str, Any]:
-        """Ask for other settings, from any thread; they hold from the next `step` on.
+        """Request other settings, from any thread; they apply from the next `step` on.
 
-        All of the change comes into force at once, or none: what is wrong with it is raised
-        here. Commands go on from where they are, within their limits.
+        A change takes effect completely or not at all: an invalid one raises here. Commands
+        continue from their present values, within their limits.
 
         Args:
             change: The change, or its JSON form (`parse_change`).
-            source: Who asks, for the record.
+            source: Who requests it, for the record.
 
         Returns:
-            The settings that will be in force, as JSON knows them.
+            The settings after the change, as plain values for JSON.
 
         Raises:
-            UnknownName: If it names something that is not there; lists what is.
-            BadValue: If a value is of the wrong kind or out of its range.
+            UnknownName: If it names something unknown; lists the known names.
+            BadValue: If a value has the wrong type or is out of range.
         """
         if not isinstance(change, Change):
             change = parse_change(change)
         return self._settings.request(change, source).to_dict()
 
     def toggle(self, name: str, source: str = "call") -> dict[str, Any]:
-        """Toggle the mode (`mode`), a constraint, or a preset against `default`, as `change`.
+        """Toggle the mode (`mode`), a constraint, or a preset against `default`; see `change`.
 
         Raises:
             UnknownName: If `name` is none of these, or the robot lacks it.
-            BadValue: If the result would not be valid.
+            BadValue: If the result would be invalid.
         """
 
         def make(settings: Settings) -> Change:
@@ -190,30 +189,30 @@ class Teleoperation:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What is in force, and the mode, as JSON knows them."""
+        """Current settings and mode, as plain values for JSON."""
         return {**self._settings.current.to_dict(), "mode": self._mode.mode.name.lower()}
 
     def show(self, progress: Progress | None) -> None:
-        """Show the operator what `step` has made of the tick.
+        """Show the operator the result of `step`.
 
         Args:
-            progress: How far the recording is, None where nothing is recorded.
+            progress: Progress of the recording, None without one.
         """
         self._feedback.show(self.device, progress)
 
     def take_requests(self) -> tuple[RecordingRequest, ...]:
-        """What the operator asks of the recording since the last call, by gestures or buttons."""
+        """Return the operator's requests to the recorder since the last call."""
         requests = tuple(self._requests)
         self._requests.clear()
         return (*requests, *self.device.take_requests())
 
     def answer(self, cue: Cue, text: str) -> None:
-        """Tell the operator what has become of a request."""
+        """Show the operator the answer to a request."""
         self._board.tell(cue, text)
 
     @property
     def alignment(self) -> Alignment:
-        """How the operator is laid on the robot."""
+        """Mapping from the operator to the robot."""
         return self._engagement.alignment
 
     @alignment.setter
@@ -222,7 +221,7 @@ class Teleoperation:
 
     @property
     def device(self) -> Device:
-        """Where the operator's motion comes from."""
+        """Source of the operator's motion."""
         return self._engagement.device
 
     @device.setter
@@ -230,17 +229,17 @@ class Teleoperation:
         self._engagement.device = device
 
     def step(self, tick: Tick) -> tuple[RobotAction, Tick]:
-        """Decide what the robot does next.
+        """Compute the robot's next action.
 
         Args:
-            tick: The robot now, as observed; its view, if there is one, is shown to the operator.
+            tick: The observed robot; its view, if any, is shown to the operator.
 
         Returns:
-            The action, limited as the robot will limit it, and the tick with what was decided.
+            The action after the robot's limits, and the tick with the decision.
 
         Raises:
-            EngageRefused: If a device that engages by itself cannot, the first time: the floor
-                of its recording is wrong, and no robot has moved yet. Later on the robot holds.
+            EngageRefused: If a self-engaging device cannot engage the first time: the floor of its
+                recording is wrong, and no robot has moved yet. Later refusals make the robot hold.
         """
         time = tick.state.time
         dt = self.dt if self._last_time is None else max(time - self._last_time, 0.0)
@@ -290,7 +289,7 @@ class Teleoperation:
         return action, tick
 
     def _apply_changes(self) -> tuple[AppliedChange, ...]:
-        """Put into force what was asked for since the last tick."""
+        """Apply the requested changes since the last tick."""
         changes = self._settings.take()
         for each in changes:
             if each.change.mode is not None:
@@ -301,7 +300,7 @@ class Teleoperation:
         return changes
 
     def _synchronise(self, state: RobotState) -> tuple[RobotState, Synced | None]:
-        """Put the measured state in accordance with the ground; the truth stays beside it."""
+        """Make the measured state consistent with the ground contacts; the true state is kept."""
         if self._sync is None:
             return state, None
         expected = self._follower.predict_velocity(state.time, self._sync.time)
@@ -309,13 +308,13 @@ class Teleoperation:
         return dataclasses.replace(state, qpos=synced.qpos, qvel=synced.qvel), synced
 
     def _compute_frames(self, state: RobotState) -> dict[str, np.ndarray]:
-        """Pose of each tracked frame of the robot, as measured. Shapes (7,)."""
+        """Compute the measured pose of each tracked frame of the robot. Shapes (7,)."""
         poses = self._kinematics.compute_poses(state.qpos)
         return {name: poses[site] for name, site in self.morphology.frames.items()}
 
     @property
     def notice(self) -> str:
-        """What the operator was told last; empty if nothing was."""
+        """Latest notice for the operator; empty if there was none."""
         return self._feedback.notice
 
     def _begin_engagement(self, state: RobotState, poses: Mapping[str, np.ndarray]) -> None:
@@ -327,7 +326,7 @@ class Teleoperation:
         self._follower.forget()
 
     def _follow_mode(self, frame: OperatorFrame | None) -> tuple[AppliedChange, ...]:
-        """Do what gestures and device ask for; return the change of mode, if there is one."""
+        """Apply mode changes by gestures and device; return the change, if any."""
         before = self._mode.mode
         self._read_gestures(frame)
         if frame is not None:
@@ -338,7 +337,7 @@ class Teleoperation:
         return (AppliedChange(source, Change(mode=self._mode.mode)),)
 
     def _read_gestures(self, frame: OperatorFrame | None) -> None:
-        """Do what the operator's hands say, whether the operator drives or not."""
+        """Apply the gestures of the operator's hands, engaged or not."""
         asked = self._hands.read(frame)
         self._requests += asked.requests
         if asked.mode:

@@ -563,7 +563,7 @@ def test_an_encoder_that_cannot_be_waited_for_is_refused(session, pair, tmp_path
         f"LeRobot {version('lerobot')} does not fit the patch 'queues of the video encoder', made "
         "for 0.6.1: lerobot.datasets.video_utils.StreamingVideoEncoder must have _frame_queues, "
         "_threads, _dropped_frames, and has no _dropped_frames. Frames of a video could be lost "
-        "without a sign, and its pictures then belong to other rows. Use "
+        "without a sign, and its images then belong to other rows. Use "
         "--dataset.streaming_encoding=false."
     )
     assert not (tmp_path / "data").exists()

@@ -145,7 +145,7 @@ def take_nothing() -> None:
             image_writer, "AsyncImageWriter", Renamed,
             "'queue of the image writer', made for 0.6.1: "
             "lerobot.datasets.image_writer.AsyncImageWriter must have queue, threads, processes, "
-            "and has no processes. Where a disk is slower than the cameras, pictures fill the "
+            "and has no processes. Where a disk is slower than the cameras, images fill the "
             "memory. Use --dataset.streaming_encoding=true.",
         ),
         (

@@ -70,7 +70,7 @@ def refuse(session: str, root: Path, **settings) -> str:
 
 
 SIZE = (
-    "its pictures of camera 'head' are 64 x 48, and the robot's {} x {}; use --robot.width=64 "
+    "its images of camera 'head' are 64 x 48, and the robot's {} x {}; use --robot.width=64 "
     "--robot.height=48"
 )
 MISFITS = {
@@ -244,7 +244,7 @@ def test_pictures_in_files_are_not_added_to_as_videos(recorded, monkeypatch, cap
     with caplog.at_level(logging.ERROR), pytest.raises(SystemExit) as stop:
         run(monkeypatch, "xop-record", *flags, "--resume=true", "--play_sounds=false")
     assert str(stop.value) == (
-        f"error: '{recorded}' cannot be added to: its pictures are of dtype video; use "
+        f"error: '{recorded}' cannot be added to: its images are of dtype video; use "
         f"--dataset.video=true. {HINT}"
     )
 

@@ -183,7 +183,7 @@ def test_pictures_that_were_not_written(
 
     monkeypatch.setattr(image_writer, "write_image", write_some)
     record(pair, dataset, 5)
-    with pytest.raises(NotSaved, match=": 1 of its 5 pictures could not be written. None was"):
+    with pytest.raises(NotSaved, match=": 1 of its 5 images could not be written. None was"):
         dataset.save_episode()
     assert not (tmp_path / "data").exists()
 

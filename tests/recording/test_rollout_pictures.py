@@ -21,9 +21,7 @@ from xop_lerobot.recording import lerobot_patches
 from xop_lerobot.recording.rollout_pictures import watch_rollouts
 
 EVENT = Event()
-TEXT = (
-    "policy was trained with pictures of 128 x 96 of camera 'head', and the robot's are 320 x 240"
-)
+TEXT = "policy was trained with images of 128 x 96 of camera 'head', and the robot's are 320 x 240"
 
 
 @pytest.fixture
@@ -111,5 +109,5 @@ def test_a_lerobot_that_has_changed_is_said(monkeypatch, caplog):
         f"LeRobot {version('lerobot')} does not fit the patch 'set-up of lerobot-rollout', made "
         "for 0.6.1: lerobot.scripts.lerobot_rollout.build_rollout_context() is expected, and "
         "lerobot.scripts.lerobot_rollout has no build_rollout_context. Nobody compares the size of "
-        "a policy's pictures with the robot's: compare --robot.width and --robot.height yourself."
+        "a policy's images with the robot's: compare --robot.width and --robot.height yourself."
     ]

@@ -1,8 +1,8 @@
-"""The columns that an episode holds beside LeRobot's own: operator, goal, retargeter, robot, time.
+"""Additional columns of an episode: operator, goal, retargeter, robot, time and outcome.
 
-No key begins with `observation` or `action`, so no policy is trained on them by accident. Every
-column is one-dimensional, and none ever holds NaN, which would break the statistics: what is not
-known is 0, and a flag says so (`operator.engaged`, `operator.tracked`).
+No key starts with `observation` or `action`, so no policy is trained on them by accident. Every
+column is one-dimensional, and none contains NaN, which would break statistics: unknown values are
+0, with a flag (`operator.engaged`, `operator.tracked`).
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from xop_lerobot.session import RobotInfo, Tick
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 COST_NAMES = (*(cost.name for cost in COSTS), "total")
-"""Terms of `retargeter.cost`; a term that a retargeter does not have is 0."""
+"""Entries of `retargeter.cost`; terms that the retargeter lacks are 0."""
 HEALTH_NAMES = (
     "solve_time", "plan_age", "effective_samples", "status", "sync_residual", "sync_status",
     "intervention", "risk",
 )  # fmt: skip
-"""Entries of `retargeter.health`; docs/use/recording.md says what they mean."""
+"""Entries of `retargeter.health`, explained in docs/use/recording.md."""
 OWN_PREFIXES = ("operator.", "goal.", "retargeter.", "robot.", "time.", "next.")
-"""What the keys of these columns begin with."""
+"""Key prefixes of these columns."""
 
 
 def is_own_column(key: str) -> bool:
-    """Whether `key` is one of this module's columns and not one of LeRobot's."""
+    """Whether `key` is one of this module's columns."""
     return key.startswith(OWN_PREFIXES)
 
 
 class Columns:
-    """The extra columns of one robot.
+    """Additional columns of one robot.
 
     Args:
         info: The robot.
@@ -64,8 +64,8 @@ class Columns:
             **{f"robot.{frame}": _feature("float32", POSE_NAMES) for frame in self._frames},
             "robot.effort": _feature("float32", effort),
             "time.sim": _feature("float64", ("s",)),
-            # Whole nanoseconds: a float32 tensor, which is how LeRobot loads any float, resolves
-            # the seconds since 1970 to two minutes.
+            # Integer nanoseconds: LeRobot loads every float as float32, whose resolution for
+            # seconds since 1970 is two minutes.
             "time.wall": _feature("int64", ("ns",)),
             "next.success": _feature("bool", ("success",)),
             "next.done": _feature("bool", ("done",)),
@@ -75,10 +75,10 @@ class Columns:
         """Build the columns of one frame.
 
         Args:
-            tick: The tick of the frame; without a decision, something else drove the robot.
+            tick: Tick of the frame; without a decision the robot was driven by something else.
 
         Returns:
-            An array for every feature, of its very dtype and shape.
+            An array per feature, with its dtype and shape.
         """
         state, frame, outcome = tick.state, tick.frame, tick.outcome
         goals = tick.goal.poses if tick.goal else {}
@@ -104,18 +104,17 @@ class Columns:
         return {key: _cast(values.get(key), spec) for key, spec in self.features.items()}
 
     def _find_position(self, tick: Tick) -> np.ndarray:
-        """Where the robot is: in truth, else as synchronised, else as measured. Shape (nq,)."""
+        """Best known position: true, else synchronised, else measured. Shape (nq,)."""
         if self._has_truth or tick.estimate is None:
             return tick.state.true_qpos
         return tick.estimate
 
 
 def has_all_columns(features: Mapping[str, Mapping], columns: Columns, root: Path) -> bool:
-    """Whether a dataset has the columns that would be recorded.
+    """Whether a dataset has all of these columns.
 
     Raises:
-        BadValue: If it has them with other entries, as a version of this project before wrote
-            them.
+        BadValue: If it has them with other entries, written by another version of this project.
     """
     if not all(key in features for key in columns.features):
         return False

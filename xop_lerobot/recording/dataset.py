@@ -1,8 +1,8 @@
 """A LeRobot dataset with the columns, episode hooks and durability of this project.
 
-`XopDataset` is `LeRobotDataset` in every respect that LeRobot's loops see: while it records,
-`features` shows LeRobot's own columns alone. What it adds comes from the session in which robot
-and teleoperator meet (`xop_lerobot.session`), so the loops need not know of it.
+`XopDataset` behaves like `LeRobotDataset` in LeRobot's loops: while recording, `features` lists
+only LeRobot's own columns. The additional data come from the session that robot and teleoperator
+share (`xop_lerobot.session`), so the loops need not know about them.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ logger = logging.getLogger(__name__)
 
 
 class XopDataset(LeRobotDataset):
-    """LeRobotDataset plus operator, goal, retargeter and robot columns.
+    """LeRobotDataset with additional columns on operator, goal, retargeter and robot.
 
     Attributes:
-        session_name: Session whose robot and teleoperator are recorded.
+        session_name: Session to record.
         extra_columns: Whether to record the columns of `xop_lerobot.recording.columns`.
-        more_facts: Facts on the next episode that only who records it knows, fit for JSON.
+        more_facts: Metadata of the next episode known only to the caller, as plain values for JSON.
     """
 
     session_name: ClassVar[str] = "default"
@@ -108,9 +108,9 @@ class XopDataset(LeRobotDataset):
             LinkError: If the session has no robot, or more than one.
             LeRobotMisfit: If LeRobot has changed so that an episode would lack something.
             WrongFps: If the robot runs at another rate.
-            BatchedEncoding: If videos should be encoded later than their episodes are saved.
-            DatasetExists: If the directory is there already.
-            NotMade: If the system does not let it be made.
+            BatchedEncoding: If videos would be encoded after their episodes are saved.
+            DatasetExists: If the directory already exists.
+            NotMade: If the directory cannot be created.
         """
         info = get_session(cls.session_name).robot
         fits(DATASET)
@@ -124,7 +124,7 @@ class XopDataset(LeRobotDataset):
         features = {**features, **(columns.features if columns else {})}
         try:
             dataset = cast("Self", super().create(repo_id, fps, features, root=root, **options))
-        except FileExistsError as error:  # somebody else was faster
+        except FileExistsError as error:  # created meanwhile by another process
             raise DatasetExists(folder) from error
         except OSError as error:
             shutil.rmtree(folder, ignore_errors=True)
@@ -137,18 +137,18 @@ class XopDataset(LeRobotDataset):
     def resume(  # pyright: ignore[reportIncompatibleMethodOverride]
         cls, repo_id: str, root: str | Path | None = None, **options: Any
     ) -> Self:
-        """Add to a dataset; see `LeRobotDataset.resume` for the arguments.
+        """Open a dataset to add episodes; see `LeRobotDataset.resume` for the arguments.
 
         A dataset that was recorded without this project's columns stays without them.
 
         Raises:
             LinkError: If the session has no robot, or more than one.
             LeRobotMisfit: If LeRobot has changed so that an episode would lack something.
-            BatchedEncoding: If videos should be encoded later than their episodes are saved.
+            BatchedEncoding: If videos would be encoded after their episodes are saved.
             BadDataset: If there is no dataset, or it cannot be read.
-            NotResumable: If it is of another robot, or of other cameras or sizes of pictures.
+            NotResumable: If it is of another robot, or has other cameras or image sizes.
             WrongFps: If the robot runs at another rate.
-            BadValue: If its columns are those of another version.
+            BadValue: If its columns are those of another version of this project.
         """
         info = get_session(cls.session_name).robot
         fits(DATASET)
@@ -172,22 +172,22 @@ class XopDataset(LeRobotDataset):
 
     @classmethod
     def _open(cls, repo_id: str, root: str | Path | None, options: dict[str, Any]) -> Self:
-        """Open a dataset to add to it; see `resume`."""
+        """Open a dataset to resume it; see `resume`."""
         if not root:
             raise BadValue("--resume=true needs --dataset.root, the directory of the dataset")
         folder = Path(root)
         existed = folder.exists()
         try:
             return cast("Self", super().resume(repo_id, root=root, **options))
-        except Exception as error:  # of JSON, parquet or the Hub, whatever is wrong with the files
+        except Exception as error:  # LeRobot raises errors of JSON, Parquet and the Hub
             unreadable = find_unreadable(folder, repo_id, error)
             if not existed:
                 with suppress(OSError):
-                    folder.rmdir()  # LeRobot makes it
+                    folder.rmdir()  # created by LeRobot
             raise unreadable from error
 
     def _check_fit(self, info: RobotInfo) -> Columns | None:
-        """Check that the robot's episodes fit; return our columns, None if there are none."""
+        """Check that the robot's episodes match; return our columns, None if there are none."""
         if self.fps != info.fps:
             raise WrongFps(info.fps, self.fps)
         columns, features = Columns(info), self.meta.features
@@ -206,7 +206,7 @@ class XopDataset(LeRobotDataset):
         self._stop_on_success = self._paused = False
         self._events: MutableMapping[str, bool] = {}
         self._last_state: RobotState | None = None
-        # Written with the first episode: a session that records none changes nothing.
+        # Written with the first saved episode, so that a session without one changes nothing.
         self._config = to_plain(self._session.configs)
         self._config_hash = compute_config_hash(self._config)
         self._attach_writer()
@@ -214,11 +214,11 @@ class XopDataset(LeRobotDataset):
 
     def _attach_writer(self) -> None:
         self._video = VideoQueue(getattr(self.writer, "_streaming_encoder", None), self.writer)
-        fits(ROLLBACK)  # a warning that comes before the disk is full
+        fits(ROLLBACK)  # warn now, not only when the disk is full
         self._patched = Patched()
         if fits(EPISODE_METADATA):
             stock = get_stock(EPISODE_METADATA, self.meta)
-            # On the instance, so that other datasets of the process are untouched.
+            # Patched on the instance, so that other datasets of the process are not affected.
             self._patched.put(EPISODE_METADATA, self._add_facts(stock), self.meta)
 
     def _add_facts(self, stock: Callable[..., None]) -> Callable[..., None]:
@@ -238,14 +238,14 @@ class XopDataset(LeRobotDataset):
         return save_with_facts
 
     def __bool__(self) -> bool:
-        """True even while it is empty: `lerobot-record` finalizes its dataset `if dataset`."""
+        """True even while empty, since `lerobot-record` finalizes its dataset only `if dataset`."""
         return True
 
-    # The episode, as LeRobot's loops drive it.
+    # Episode methods, in the order in which LeRobot's loops call them.
 
     @property
     def features(self) -> dict[str, dict]:
-        """All columns; while recording, only those that LeRobot's loops fill."""
+        """All features; while recording, only those that LeRobot's loops fill."""
         features = self.meta.features
         if self.writer is None or self._is_finalized:
             return features
@@ -258,12 +258,12 @@ class XopDataset(LeRobotDataset):
         *,
         stop_on_success: bool = False,
     ) -> None:
-        """Say how the episode that begins now ends.
+        """Start an episode, and define when it ends.
 
         Args:
             events: The loop's events; `exit_early` is set when the episode is over.
-            tick_limit: Frames after which it is over, None to leave that to the loop.
-            stop_on_success: Whether it is over as soon as the task is accomplished.
+            tick_limit: Number of frames after which it is over, None to leave that to the loop.
+            stop_on_success: Whether it ends as soon as the task is accomplished.
         """
         self._events, self._tick_limit = events, tick_limit
         self._stop_on_success, self._paused = stop_on_success, False
@@ -271,11 +271,11 @@ class XopDataset(LeRobotDataset):
         self.forget_presses()
 
     def forget_presses(self) -> None:
-        """Forget keys that were pressed while the last episode was saved or the robot started over.
+        """Discard key presses from before the first frame of the episode.
 
-        Saving takes a second in which nothing seems to happen, so people press again; what they
-        mean is the episode that they have seen. Only Esc still counts: it ends the session, and
-        an episode without a frame is left out.
+        Saving and resetting take a second without visible progress, so people press again, meaning
+        the previous episode. Only Esc still counts: it ends the session, and an episode without
+        frames is left out.
         """
         if self._tally.frames or not self._events:
             return
@@ -283,14 +283,14 @@ class XopDataset(LeRobotDataset):
         self._events["exit_early"] = self._events["rerecord_episode"] = stops
 
     def pause(self, events: MutableMapping[str, bool]) -> None:
-        """Say that the pause after an episode begins, in which that can still be discarded."""
+        """Start the pause after an episode, during which it can still be discarded."""
         self._events, self._paused = events, True
         progress = self._session.progress
         if progress is not None:
             self._session.progress = dataclasses.replace(progress, paused=True)
 
     def grant(self, request: RecordingRequest) -> tuple[Cue, str]:
-        """Do with the episode what the operator asks for; return what to tell the operator."""
+        """Fulfil a request of the operator; return the notice for the operator."""
         tick = self._session.tick
         time = 0.0 if tick is None else tick.state.time
         told = grant(request, self._events, self._tally, paused=self._paused, time=time)
@@ -300,12 +300,13 @@ class XopDataset(LeRobotDataset):
         return told
 
     def add_frame(self, frame: dict) -> None:
-        """Add a frame with this tick's extra columns, and the action that the robot executes.
+        """Add a frame with this tick's extra columns and the executed action.
 
         Raises:
-            LinkError: If the robot was not observed before the frame, or has executed no action.
-            BadValue: If the frame is of an earlier tick, whose columns nobody knows any more.
-            NotSaved: If it cannot be written; a full disk is the usual reason.
+            LinkError: If the robot was not observed before the frame, or has not executed an
+                action.
+            BadValue: If the frame belongs to an earlier tick, whose columns are gone.
+            NotSaved: If it cannot be written, usually because the disk is full.
         """
         tally, tick = self._tally, self._session.tick
         frame = put_executed(frame, tick, self.meta.features)
@@ -360,17 +361,18 @@ class XopDataset(LeRobotDataset):
     def save_episode(
         self, episode_data: dict | None = None, parallel_encoding: bool = True
     ) -> None:
-        """Save the episode so that it survives a crash, and ask the robot to start over.
+        """Save the episode durably, and request a reset of the robot.
 
-        One without a frame is none, and is not saved. If saving fails, the dataset is closed as
-        it was before.
+        An episode without frames is not saved. If saving fails, the dataset is restored to its
+        previous state and closed.
 
         Raises:
-            NotSaved: If the episode cannot be written; a full disk is the usual reason.
-            XopError: If frames of its videos were lost in lock-step.
+            NotSaved: If the episode cannot be written, usually because the disk is full.
+            XopError: If video frames were lost in lock-step.
         """
         if episode_data is None and not self.has_pending_frames():
-            if self._events:  # else none has begun: LeRobot's rollouts save once more at their end
+            # Without events no episode was begun: LeRobot's rollouts save once more at their end.
+            if self._events:
                 logger.warning("Episode %d has no frame; it is not saved.", self.num_episodes)
             return
         facts, index = self._collect_facts(), self.num_episodes
@@ -398,12 +400,12 @@ class XopDataset(LeRobotDataset):
         self._begin_next(index + 1)
 
     def clear_episode_buffer(self, delete_images: bool = True) -> None:
-        """Discard the episode and ask the robot to start over."""
+        """Discard the episode and request a reset of the robot."""
         super().clear_episode_buffer(delete_images)
         self._begin_next(self.num_episodes)
 
     def finalize(self) -> None:
-        """Close all files; a dataset that never got an episode is removed again."""
+        """Close all files; a new dataset without episodes is removed again."""
         if self._is_finalized:
             return
         super().finalize()
@@ -421,7 +423,7 @@ class XopDataset(LeRobotDataset):
         self._session.begin_episode(index)
 
     def _secure(self) -> None:
-        """Close the files of the episode that was saved; the next one opens others."""
+        """Close the files of the saved episode; the next episode opens new ones."""
         if fits(ROTATION):
             writer.rotate_writers(self)
             return
@@ -431,7 +433,7 @@ class XopDataset(LeRobotDataset):
         options = {key: value for key, value in self._create_options.items() if key in known}
         fresh = super().resume(self.repo_id, root=self.root, **options)
         self.__dict__.update(vars(fresh))  # LeRobot's attributes alone
-        # `fresh` shares the writer now; it must not close it when it is collected.
+        # The writer belongs to `self` now; `fresh` must not close it when garbage-collected.
         fresh.writer = None
         self._attach_writer()
 

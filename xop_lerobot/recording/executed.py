@@ -1,4 +1,4 @@
-"""The action of a frame is what the robot executes, also where a policy asked for more."""
+"""Records the executed action in place of the requested one."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 def put_executed(
     frame: Mapping[str, Any], tick: Tick | None, features: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Put what the robot executes in the place of the action of a frame.
+    """Replace the action of a frame by the action that the robot executes.
 
-    LeRobot's loops record the action that was asked for and drop the answer of `send_action`.
-    A teleoperator of this project asks for nothing else than what is executed, and a policy may.
+    LeRobot's loops record the requested action and drop the return value of `send_action`. This
+    project's teleoperator only requests what is executable, but a policy may request more.
 
-    A frame of another tick stays as it is, and so does one with other joints than the robot's,
-    as processors of one's own make them.
+    A frame of another control step is returned unchanged, as is one whose entries do not match the
+    robot's, as custom processors may produce.
 
     Args:
         frame: The frame.
-        tick: The session's present tick, None if there is none.
-        features: Columns of the dataset.
+        tick: The session's current tick, None if there is none.
+        features: Features of the dataset.
     """
     frame = dict(frame)
     if tick is None or tick.executed is None:
@@ -43,7 +43,7 @@ def put_executed(
 def _build(
     column: str, values: Mapping[str, float], features: Mapping[str, Mapping[str, Any]]
 ) -> np.ndarray | None:
-    """Build a column of a frame as LeRobot does; None where it has other entries."""
+    """Build a column of a frame as LeRobot does; None if its entries do not match `values`."""
     names = features.get(column, {}).get("names") or ()
     if not names or any(name not in values for name in names):
         return None

@@ -1,7 +1,7 @@
-"""Facts on each episode and on the session, kept beside the frames.
+"""Episode metadata of this project ("facts"), and the session's configuration.
 
-They are written twice: as `xop/*` columns of LeRobot's episode metadata, and as one JSON object a
-line in `meta/xop/episodes.jsonl`, because some LeRobot tools drop columns that they do not know.
+Facts are written twice: as `xop/*` columns of LeRobot's episode metadata, and as one JSON object
+per line in `meta/xop/episodes.jsonl`, because some LeRobot tools drop unknown columns.
 """
 
 from __future__ import annotations
@@ -28,38 +28,38 @@ FACTS_DIR = Path("meta") / "xop"
 EPISODES_FILE = FACTS_DIR / "episodes.jsonl"
 CONFIG_FILE = FACTS_DIR / "config.json"
 CONFIGS_DIR = FACTS_DIR / "configs"
-"""Every configuration by its hash, where the episodes differ in it."""
+"""All configurations by hash, if episodes have different ones."""
 FACTS_PREFIX = "xop/"
 _JSON_FACTS = ("versions", "settings", "changes")
 
 
 @dataclass(frozen=True)
 class EpisodeFacts:
-    """What is known of one episode as a whole.
+    """Metadata of one episode.
 
     Attributes:
-        success: Whether the task was accomplished; False where no task ran.
+        success: Whether the task was accomplished; False without a task.
         fallen: Whether the robot fell.
-        collision: Whether the robot touched anything but the ground.
-        finished: Whether the operator's recording or script had played out.
+        collision: Whether the robot touched itself, or anything but the ground.
+        finished: Whether the operator's recording or script had played to its end.
         seed: Seed of the session.
-        task: The task in words.
+        task: Task description.
         robot: LeRobot's robot type.
         scene: Scene of the simulation.
         low_level: Low-level policy.
         clock: `lockstep` or `realtime`.
-        config_hash: SHA-256 over the resolved configuration, `meta/xop/config.json`.
-        versions: Versions of the packages that decide the data, as JSON.
+        config_hash: SHA-256 of the resolved configuration, `meta/xop/config.json`.
+        versions: Versions of the packages that determine the data, as JSON.
         start_time: Host clock at the first frame [s since the epoch].
-        real_fps: Frames per second of the host clock; in real time it should be the dataset's.
-        dropped_frames: Video frames that the encoder dropped; the pictures after one are shifted.
+        real_fps: Frame rate by the host clock [Hz]; in real time it should equal the dataset's.
+        dropped_frames: Number of video frames dropped by the encoder; later images are shifted.
         late: Whether a real-time episode ran at less than 95 % of its rate.
-        settings: What was in force at the first frame (preset, weights, targets, body,
-            constraints, mode), as JSON; an empty object where no teleoperator drove.
-        changes: What changed in the course of it, as a JSON list of objects: `frame`, `time` of
-            the robot's clock [s], `source` and `change`. What the robot itself does wrong (it
-            moves though it is told to stand, or gives way under a load) is among them, with the
-            source `robot` and the change `trouble`.
+        settings: Settings at the first frame (preset, weights, targets, body, constraints, mode),
+            as JSON; an empty object without a teleoperator.
+        changes: Changes during the episode, as a JSON list of objects: `frame`, `time` of the
+            robot's clock [s], `source` and `change`. Troubles of the robot (it moves though it
+            should stand, or gives way under a load) are included with the source `robot` and the
+            change `trouble`.
     """
 
     success: bool
@@ -87,17 +87,17 @@ class EpisodeFacts:
 
 
 _LATE = 0.95
-"""Share of its rate under which a real-time episode is marked as late."""
+"""Share of the nominal rate below which a real-time episode is marked as late."""
 
 
 def gather_facts(tally: Tally, info: RobotInfo, config_hash: str, dropped: int) -> EpisodeFacts:
-    """Gather the facts on the episode that is being recorded.
+    """Collect the metadata of the episode being recorded.
 
     Args:
-        tally: What was counted in it.
+        tally: Its counts.
         info: Its robot.
         config_hash: Hash of its configuration.
-        dropped: Video frames that the encoder dropped.
+        dropped: Number of video frames dropped by the encoder.
     """
     return EpisodeFacts(
         success=tally.success,
@@ -122,7 +122,7 @@ def gather_facts(tally: Tally, info: RobotInfo, config_hash: str, dropped: int) 
 
 
 FACT_COLUMNS = tuple(f"{FACTS_PREFIX}{each.name}" for each in dataclasses.fields(EpisodeFacts))
-"""Names of the facts in LeRobot's episode metadata."""
+"""Column names in LeRobot's episode metadata."""
 
 
 def append_facts(
@@ -132,14 +132,14 @@ def append_facts(
     facts: EpisodeFacts,
     more: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Add the line of `episode`, which has `length` frames, and see it on the disk.
+    """Append the line of `episode`, and flush it to disk.
 
     Args:
         root: Directory of the dataset.
         episode: Index of the episode.
-        length: Its frames.
-        facts: The facts.
-        more: Facts that not every episode has, fit for JSON.
+        length: Number of frames.
+        facts: Metadata of the episode.
+        more: Further metadata that not every episode has, as plain values for JSON.
     """
     row = {"episode_index": episode, "length": length, **dataclasses.asdict(facts)}
     for name in _JSON_FACTS:
@@ -149,7 +149,7 @@ def append_facts(
 
 
 def read_facts(root: Path) -> list[dict[str, Any]]:
-    """Read `meta/xop/episodes.jsonl`; a line that a crash cut off is left out."""
+    """Read `meta/xop/episodes.jsonl`; a line truncated by a crash is left out."""
     return [row for row in read_lines(root / EPISODES_FILE) if row is not None]
 
 
@@ -161,10 +161,10 @@ def write_config(root: Path, config: Mapping[str, Any]) -> None:
 
 
 def keep_config(root: Path, config: Mapping[str, Any]) -> None:
-    """Keep the configuration of a session beside those that the dataset has.
+    """Store the configuration of a session in the dataset.
 
-    `meta/xop/config.json` is that of the first session. Where another one's differs, both are in
-    `meta/xop/configs/`, by the hash that the facts name.
+    `meta/xop/config.json` is that of the first session. If a later one differs, both are also
+    stored in `meta/xop/configs/`, by the hash in the episode metadata.
     """
     path = root / CONFIG_FILE
     if not path.exists():
@@ -184,13 +184,13 @@ def keep_config(root: Path, config: Mapping[str, Any]) -> None:
 
 
 def compute_config_hash(config: Mapping[str, Any]) -> str:
-    """Compute the SHA-256 of a configuration, the same for the same values in any order."""
+    """Compute the SHA-256 of a configuration, independent of key order."""
     text = json.dumps(to_plain(config), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def to_plain(value: Any) -> Any:  # any configuration value
-    """Turn dataclasses, paths, enums and tuples into what JSON knows."""
+    """Convert dataclasses, paths, enums and tuples to JSON values."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
             field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)

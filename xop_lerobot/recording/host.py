@@ -1,10 +1,10 @@
-"""Let LeRobot's own commands record `XopDataset`s, and hold lock-step episodes to their length.
+"""Let LeRobot's own commands record `XopDataset`s, with lock-step episodes of exact length.
 
-LeRobot offers no way to add columns, or a hook for the episodes' boundaries, from its command
-line. While an xop teleoperator exists, this module therefore puts two names of LeRobot's modules
-in the place of LeRobot's own: the dataset class, and in `lerobot-record` the loop of one episode,
-which is LeRobot's with another clock. Robots and teleoperators of others are passed through
-unchanged. What it expects of LeRobot is in `xop_lerobot.recording.lerobot_patches`.
+LeRobot has no command-line option for additional columns, and no hooks for episode boundaries.
+While an xop teleoperator exists, this module therefore replaces two names in LeRobot's modules: the
+dataset class and, in `lerobot-record`, the loop of one episode, which then runs on another clock.
+Robots and teleoperators of other projects are not affected. What is expected of LeRobot is listed
+in `xop_lerobot.recording.lerobot_patches`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _HAS_OWN_LOOP = ContextVar("has_own_loop", default=False)
 
 @contextmanager
 def own_loop() -> Iterator[None]:
-    """In the block, teleoperators patch no command of LeRobot: the program has its own loop."""
+    """Within the block teleoperators do not patch LeRobot: the program has its own loop."""
     token = _HAS_OWN_LOOP.set(True)
     try:
         yield
@@ -52,12 +52,12 @@ def own_loop() -> Iterator[None]:
 
 
 class Host:
-    """LeRobot's `lerobot-record` and `lerobot-rollout`, as far as this project changes them.
+    """Patches `lerobot-record` and `lerobot-rollout` to record this project's data.
 
     Args:
-        session: Session whose episodes are recorded.
+        session: Session to record.
         extra_columns: Whether to record the columns of `xop_lerobot.recording.columns`.
-        has_person: Whether a person holds the device, who needs time between the episodes.
+        has_person: Whether a person operates the device and needs time between episodes.
     """
 
     def __init__(
@@ -70,10 +70,10 @@ class Host:
         self._terminator = TermAsInterrupt()
 
     def install(self) -> None:
-        """Patch the command of LeRobot that runs, if it is one that records.
+        """Patch the running LeRobot command, if it is one that records.
 
         Raises:
-            LeRobotMisfit: If `lerobot-record` has changed so that episodes would lack something.
+            LeRobotMisfit: If `lerobot-record` has changed so that episodes would be incomplete.
         """
         records, rolls_out = runs(RECORD_MODULE), runs(CONTEXT_MODULE)
         if _HAS_OWN_LOOP.get() or not (records or rolls_out):
@@ -93,7 +93,7 @@ class Host:
             self._terminator.install()
 
     def remove(self) -> None:
-        """Put LeRobot's own back; may be called twice."""
+        """Restore LeRobot's own objects; may be called twice."""
         self._patched.undo()
         self._terminator.remove()
 
@@ -107,7 +107,7 @@ class Host:
                 lockstep = not get_session(self._session).robot.realtime
                 dataset: XopDataset | None = call.get("dataset")
                 if dataset is None and lockstep and not self._has_person:
-                    # The robot resets itself, and nobody has to tidy a simulation.
+                    # Skip the pause: the simulation resets itself and no person needs time.
                     return
                 recorder = get_session(self._session).recorder
                 if dataset is None and recorder is not None:
@@ -118,7 +118,7 @@ class Host:
                     call["control_time_s"] = math.inf
                 elif dataset is not None:
                     dataset.begin(call["events"], None)
-                    # The robot starts over in an observation: not on the episode's time.
+                    # Resets happen inside an observation; do it before the episode's time starts.
                     call["robot"].get_observation()
                 if lockstep:
                     with without_slowness():
@@ -136,11 +136,11 @@ class Host:
 
 
 def count_in_frames(stock: Callable[..., None], session: str) -> Callable[..., None]:
-    """Make LeRobot's loop of one episode end by its number of frames, for a lock-step robot.
+    """Make LeRobot's rollout loop end by number of frames for a lock-step robot.
 
     Args:
         stock: `EpisodicStrategy._policy_loop`.
-        session: Session whose robot is driven.
+        session: Session of the robot.
     """
     signature = inspect.signature(stock)
 
@@ -170,7 +170,7 @@ def _check_multiplier(strategy: object, fps: int) -> None:
     """Check that each action of the policy is sent once.
 
     Raises:
-        BadValue: If LeRobot sends actions between them: each moves a lock-step robot by a tick.
+        BadValue: If LeRobot interpolates: each action sent advances a lock-step robot by one step.
     """
     multiplier = getattr(getattr(strategy, "_interpolator", None), "multiplier", 1)
     if multiplier != 1:

@@ -1,11 +1,11 @@
 """Every patch of LeRobot: what this project replaces in it, or reads of its private parts.
 
-This is the file to compare with the release notes of LeRobot. `PATCHES` lists each place with what
-is expected of it, what it is for, and the change of LeRobot that would make it unnecessary. What is
-only imported is not listed: if it is gone, Python says so.
+Compare this file with LeRobot's release notes. `PATCHES` lists each patched place with what is
+expected there, its purpose, and the change in LeRobot that would make it unnecessary. Plain imports
+are not listed: if one is gone, Python raises an error.
 
-Each patch is checked before it is used (`fits`), and `xop-doctor` checks all. Where data would be
-wrong or incomplete without one, that is an error; elsewhere a warning says what is lost.
+Each patch is checked before use (`fits`), and `xop-doctor` checks all. If data would be wrong or
+incomplete without it, a misfit is an error; otherwise a warning says what is lost.
 
 Made for LeRobot 0.6.1. The loops of its main branch (`7427f318`, 2026-11-30), which take a `timer`
 and no `fps`, fit too.
@@ -36,7 +36,7 @@ MADE_FOR = "0.6.1"
 
 
 class Use(Enum):
-    """What is done with a part of LeRobot."""
+    """How a part of LeRobot is patched or used."""
 
     REPLACED = "an object of this project has its name"
     WRAPPED = "a function of this project has its name, and calls it"
@@ -46,18 +46,18 @@ class Use(Enum):
 
 @dataclass(frozen=True)
 class Patch:
-    """A part of LeRobot that this project relies on beyond its documented interface.
+    """A part of LeRobot that this project uses beyond its documented interface.
 
     Attributes:
-        name: What messages call it.
-        use: What is done with it.
-        expects: What must be there, by place: `module:function()` with names of its parameters, or
-            `module:class` with names of attributes. The first place is what is replaced. Empty
-            where a misfit shows by itself.
-        purpose: What it is for.
-        waits_for: Change of LeRobot that would make it unnecessary.
-        without: What follows where it does not fit, and what to do; a sentence or two.
-        required: Whether nothing may be recorded without it.
+        name: Name in messages.
+        use: How it is used.
+        expects: Requirements by place: `module:function()` with parameter names, or `module:class`
+            with attribute names. The first place is what is replaced. Empty if a misfit is obvious
+            by itself.
+        purpose: Purpose.
+        waits_for: Change in LeRobot that would make it unnecessary.
+        without: Consequence of a misfit and what to do; a sentence or two.
+        required: Whether recording is refused without it.
     """
 
     name: str
@@ -148,10 +148,10 @@ ROLLOUT_PICTURES = Patch(
     "set-up of lerobot-rollout",
     Use.WRAPPED,
     {f"{ROLLOUT_MODULE}:build_rollout_context()": ("cfg",)},
-    purpose="A policy that was trained with pictures of another size is refused.",
+    purpose="A policy that was trained with images of another size is refused.",
     waits_for="a comparison of sizes, and not only of names, in LeRobot",
     # It only refuses what is wrong.
-    without="Nobody compares the size of a policy's pictures with the robot's: compare "
+    without="Nobody compares the size of a policy's images with the robot's: compare "
     "--robot.width and --robot.height yourself.",
 )
 EPISODE_METADATA = Patch(
@@ -204,18 +204,18 @@ ENCODER = Patch(
     },
     purpose="In lock-step recording waits for the encoder; in real time lost frames are counted.",
     waits_for="PR #4462: no frame is dropped offline",
-    without="Frames of a video could be lost without a sign, and its pictures then belong to other "
+    without="Frames of a video could be lost without a sign, and its images then belong to other "
     "rows. Use --dataset.streaming_encoding=false.",
-    required=True,  # nothing in such a dataset shows that its pictures are wrong
+    required=True,  # nothing in such a dataset shows that its images are wrong
 )
 IMAGES = Patch(
     "queue of the image writer",
     Use.READ,
     {"lerobot.datasets.image_writer:AsyncImageWriter": ("queue", "threads", "processes")},
-    purpose="Recording waits while many pictures wait for a slow disk.",
+    purpose="Recording waits while many images wait for a slow disk.",
     waits_for="a queue with an end in LeRobot's image writer",
     # Most disks are fast enough.
-    without="Where a disk is slower than the cameras, pictures fill the memory. Use "
+    without="Where a disk is slower than the cameras, images fill the memory. Use "
     "--dataset.streaming_encoding=true.",
 )
 EMBEDDING = Patch(
@@ -251,9 +251,9 @@ SLOW_TICKS = Patch(
     without="LeRobot warns of each slow tick in lock-step.",
 )
 SLOW_TICK_TEXT = "loop is running slower"
-"""Of that warning: of the "Record loop" in 0.6.1, of the "Control loop" after it."""
+"""Part of that warning's text: "Record loop" in 0.6.1, "Control loop" later."""
 SLOW_TICK_LOGGERS = (None, "lerobot.rollout.strategies.episodic", "lerobot.utils.cycle_timer")
-"""Loggers that may give it, by LeRobot's version and command; None is the root."""
+"""Loggers that may emit it, by LeRobot's version and command; None is the root logger."""
 
 PATCHES = (
     DATASET, RECORD_DATASET, RECORD_LOOP, CONTEXT_DATASET, POLICY_LOOP, ROLLOUT_PICTURES,
@@ -263,14 +263,14 @@ PATCHES = (
 
 
 class LeRobotMisfit(XopError):
-    """LeRobot is not as a patch expects it, and nothing may be recorded without that one."""
+    """LeRobot does not fit a patch without which recording is refused."""
 
 
 def fits(patch: Patch) -> bool:
-    """Whether LeRobot is as `patch` expects it; if not, say so, each fault once a process.
+    """Whether LeRobot fits `patch`; each misfit is logged once per process.
 
     Raises:
-        LeRobotMisfit: If it is not, and the patch is required.
+        LeRobotMisfit: If it does not, and the patch is required.
     """
     text = find_misfit(patch)
     if text and patch.required:
@@ -285,7 +285,7 @@ _said: set[str] = set()
 
 
 def find_misfit(patch: Patch) -> str:
-    """Say what of LeRobot is not as `patch` expects it, and what follows; empty if all is."""
+    """Describe how LeRobot does not fit `patch`, and the consequence; empty if it fits."""
     faults = [_find_fault(patch.use, place, names) for place, names in patch.expects.items()]
     fault = "; ".join(filter(None, faults))
     if not fault:
@@ -315,11 +315,11 @@ def _find_fault(use: Use, place: str, names: tuple[str, ...]) -> str:
 
 
 def _find_owner(place: str) -> tuple[Any, str]:
-    """Return what holds the function or class of `module:Class.method()`, and its name.
+    """Return the object that holds `module:Class.method()`, and the last name.
 
     Raises:
         ImportError: If there is no such module.
-        AttributeError: If it has not what is named in it.
+        AttributeError: If a name in it does not exist.
     """
     module, _, path = place.removesuffix("()").partition(":")
     label, names = module, path.split(".")
@@ -338,7 +338,7 @@ def _list_parameters(function: Callable[..., Any]) -> tuple[str, ...]:
 
 
 def get_signature(function: Callable[..., Any]) -> inspect.Signature:
-    """Return the signature of LeRobot's own function, under ours and under LeRobot's decorators."""
+    """Return the signature of LeRobot's own function, below our patch and LeRobot's decorators."""
     inner = getattr(function, "xop_stock", function)
     if inspect.isfunction(inner):
         # LeRobot's `safe_stop_image_writer` hides the loop in a closure.
@@ -355,7 +355,7 @@ def _has(owner: Any, name: str) -> bool:
 
 
 def _list_set(member: Any) -> set[str]:
-    """List the attributes that a method sets, of whatever object."""
+    """List the attributes that a method assigns, on any object."""
     function = getattr(member, "__func__", member)
     if not isinstance(function, FunctionType):
         return set()
@@ -364,7 +364,7 @@ def _list_set(member: Any) -> set[str]:
 
 
 def find(name: str) -> ModuleType | None:
-    """Return LeRobot's module `name` if it is loaded, also when it is the program itself."""
+    """Return LeRobot's module `name` if it is loaded, also as the main program."""
     main = sys.modules.get("__main__")
     if main is not None and getattr(getattr(main, "__spec__", None), "name", None) == name:
         return main
@@ -372,9 +372,9 @@ def find(name: str) -> ModuleType | None:
 
 
 def runs(module: str) -> bool:
-    """Whether LeRobot's command that uses `module` runs, by what is loaded or the program's name.
+    """Whether the LeRobot command that uses `module` is running, by loaded modules or program name.
 
-    So a command whose module LeRobot has moved is noticed too.
+    The program name also detects a command whose module LeRobot has moved.
     """
     program = Path(sys.argv[0]).stem if sys.argv else ""
     return find(module) is not None or program == _COMMANDS[module]
@@ -386,22 +386,22 @@ class _Replaced(NamedTuple):
     stock: Any
     ours: Any
     own: bool
-    """Whether `owner` itself had the name, or what it inherits from."""
+    """Whether `owner` itself had the name, not a base class."""
 
 
 class Patched:
-    """What is replaced in LeRobot for now, to be put back together."""
+    """A set of replaced objects of LeRobot, restored together."""
 
     def __init__(self) -> None:
         self._replaced: list[_Replaced] = []
 
     def put(self, patch: Patch, ours: Any, owner: Any = None) -> None:
-        """Put `ours` where `patch` says; the patch must fit.
+        """Install `ours` at the place of `patch`, which must fit.
 
         Args:
-            patch: A patch that is replaced or wrapped.
-            ours: What stands there from now on; it gets an attribute `xop_stock`.
-            owner: The one instance that is patched, None for all of LeRobot.
+            patch: A patch whose use is replacing or wrapping.
+            ours: The replacement; it gets an attribute `xop_stock`.
+            owner: The single instance to patch, None for all of LeRobot.
         """
         owner, name = _locate(patch, owner)
         stock = get_stock(patch, owner)
@@ -410,7 +410,7 @@ class Patched:
         setattr(owner, name, ours)
 
     def undo(self) -> None:
-        """Put LeRobot's own back, but where others came after; may be called twice."""
+        """Restore LeRobot's objects, except where patched again since; may be called twice."""
         for each in reversed(self._replaced):
             if getattr(each.owner, each.name) is not each.ours:
                 continue
@@ -422,25 +422,25 @@ class Patched:
 
 
 def get_stock(patch: Patch, owner: Any = None) -> Any:
-    """Return LeRobot's own of what `patch` replaces, also where it is replaced already."""
+    """Return LeRobot's own object at the place of `patch`, also if it is patched."""
     current = getattr(*_locate(patch, owner))
     return getattr(current, "xop_stock", current)
 
 
 def is_patched(patch: Patch) -> bool:
-    """Whether something of ours stands where `patch` says."""
+    """Whether the place of `patch` is patched."""
     return hasattr(getattr(*_locate(patch)), "xop_stock")
 
 
 def _locate(patch: Patch, owner: Any = None) -> tuple[Any, str]:
-    """Return what holds the thing that is replaced, or that one instance; and its name."""
+    """Return the owner of the replaced object (or the given instance), and its name."""
     place, name = _find_owner(next(iter(patch.expects)))
     return (place if owner is None else owner), name
 
 
 @contextmanager
 def replaced(patch: Patch, ours: Any) -> Iterator[None]:
-    """In the block, put `ours` where `patch` says, if it fits."""
+    """Within the block, install `ours` at the place of `patch`, if it fits."""
     patched = Patched()
     if fits(patch):
         patched.put(patch, ours)

@@ -1,4 +1,4 @@
-"""An episode in lock-step has a number of frames, and no tick of it is late."""
+"""Helpers for lock-step recording: episode length in frames, no warnings of slow steps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from xop_lerobot.recording.lerobot_patches import SLOW_TICK_LOGGERS, SLOW_TICK_T
 
 @contextmanager
 def without_slowness() -> Iterator[None]:
-    """Leave out LeRobot's warning of every slow tick: in lock-step none is wrong, only later."""
+    """Suppress LeRobot's warnings of slow steps: in lock-step they do not affect the data."""
 
     def is_other(record: logging.LogRecord) -> bool:
         return SLOW_TICK_TEXT not in str(record.msg)
@@ -27,5 +27,5 @@ def without_slowness() -> Iterator[None]:
 
 
 def count_ticks(duration: float, fps: int) -> int:
-    """Count the frames of an episode of `duration` [s] at `fps` [Hz], at least one."""
+    """Number of frames of an episode of `duration` [s] at `fps` [Hz], at least one."""
     return max(1, round(duration * fps))

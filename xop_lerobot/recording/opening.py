@@ -1,4 +1,4 @@
-"""May a dataset be made, or be added to: does it hold what the robot would record, and no more?"""
+"""Checks before a dataset is created or resumed: rates, columns, cameras and encoding."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 PICTURES = f"{OBS_IMAGES}."
 _OTHERS = ("intervention",)
-"""Columns that LeRobot's rollouts fill beside those of the robot."""
+"""Columns that LeRobot's rollouts add to those of the robot."""
 
 
 class DatasetExists(XopError, FileExistsError):
-    """The directory of a new dataset is there already."""
+    """The directory of a new dataset already exists."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(
@@ -32,14 +32,14 @@ class DatasetExists(XopError, FileExistsError):
 
 
 class NotMade(XopError):
-    """The directory of a new dataset cannot be made."""
+    """The directory of a new dataset cannot be created."""
 
     def __init__(self, root: Path, reason: str) -> None:
         super().__init__(f"dataset directory '{root}' cannot be made: {reason}")
 
 
 class WrongFps(XopError, ValueError):
-    """Robot and dataset run at different rates."""
+    """Robot and dataset have different rates."""
 
     def __init__(self, robot_fps: int, dataset_fps: int) -> None:
         super().__init__(
@@ -49,7 +49,7 @@ class WrongFps(XopError, ValueError):
 
 
 class BatchedEncoding(XopError, ValueError):
-    """Videos should be encoded later than their episodes are saved."""
+    """Videos would be encoded after their episodes are saved."""
 
     def __init__(self, size: int) -> None:
         super().__init__(
@@ -60,7 +60,7 @@ class BatchedEncoding(XopError, ValueError):
 
 
 class NotResumable(XopError, ValueError):
-    """A dataset cannot be added to; nothing of it has been changed."""
+    """A dataset cannot be resumed; it has not been changed."""
 
     def __init__(self, root: object, faults: Iterable[str]) -> None:
         super().__init__(
@@ -70,15 +70,15 @@ class NotResumable(XopError, ValueError):
 
 
 def check_encoding(options: Mapping[str, Any]) -> None:
-    """Refuse encoding that may lose pictures.
+    """Refuse encoder settings that may lose images.
 
-    LeRobot encodes batches of videos after their episodes are saved. Each episode has files of its
-    own here, closed when it is saved; a batch would look for the rows of all its episodes in one of
-    them, and a killed process would lose its pictures.
+    LeRobot encodes batches of videos after their episodes are saved. Here each episode has its own
+    files, closed when it is saved: a batch would look for the rows of all its episodes in one of
+    them, and a killed process would lose its images.
 
     Raises:
         BatchedEncoding: If a batch is larger than one episode.
-        LeRobotMisfit: If LeRobot's streaming encoder cannot be waited for.
+        LeRobotMisfit: If LeRobot's streaming encoder does not fit the patch that waits for it.
     """
     size = options.get("batch_encoding_size", 1)
     if size > 1:
@@ -88,12 +88,12 @@ def check_encoding(options: Mapping[str, Any]) -> None:
 
 
 def find_unreadable(folder: Path, repo_id: str, error: Exception) -> BadDataset:
-    """Say why a dataset could not be opened to be added to, and what to do.
+    """Explain why a dataset could not be opened to resume it, and what to do.
 
     Args:
-        folder: Its directory.
-        repo_id: Its name on the Hub.
-        error: What LeRobot has raised: of JSON, parquet or the Hub, whatever is wrong.
+        folder: Directory of the dataset.
+        repo_id: Name of the dataset on the Hub.
+        error: LeRobot's exception, from JSON, Parquet or the Hub.
     """
     first = (str(error).splitlines() or [""])[0]
     fault = f"it cannot be read ({type(error).__name__}: {first}). "
@@ -114,17 +114,17 @@ def check_resumable(
     info: RobotInfo,
     own: Collection[str],
 ) -> None:
-    """Check that a dataset has the columns that are recorded of a robot, and no others.
+    """Check that a dataset has exactly the columns that the robot records.
 
     Args:
         root: Directory of the dataset.
-        robot_type: The robot that it was recorded with, None where that is not known.
-        features: Its columns.
-        info: The robot that would be recorded.
-        own: This project's columns of that robot, of which it may have all or none.
+        robot_type: Robot type it was recorded with, None if unknown.
+        features: Features of the dataset.
+        info: The robot to record.
+        own: This project's columns for that robot; the dataset must have all or none.
 
     Raises:
-        NotResumable: If not, with every difference.
+        NotResumable: If it does not, with every difference.
     """
     if robot_type not in (None, info.name):
         raise NotResumable(root, [f"it is of {robot_type}, and the robot is {info.name}"])
@@ -150,16 +150,16 @@ def check_resumable(
 def check_storage(
     root: Path, features: Mapping[str, Mapping[str, Any]], *, use_videos: bool
 ) -> None:
-    """Check that the pictures of a dataset are stored as they would be recorded.
+    """Check that images are stored in the format that the flags ask for.
 
     Raises:
-        NotResumable: If it has files of pictures and not videos, or the other way round.
+        NotResumable: If it stores image files and the flags ask for videos, or vice versa.
     """
     stored = {features[key]["dtype"] for key in features if key.startswith(PICTURES)}
     wanted = "video" if use_videos else "image"
     if stored - {wanted}:
         flag = str(not use_videos).lower()
-        fault = f"its pictures are of dtype {', '.join(sorted(stored))}; use --dataset.video={flag}"
+        fault = f"its images are of dtype {', '.join(sorted(stored))}; use --dataset.video={flag}"
         raise NotResumable(root, [fault])
 
 
@@ -203,7 +203,7 @@ def _compare_cameras(features: Mapping[str, Mapping[str, Any]], info: RobotInfo)
         (height, width, *_), (robot_height, robot_width, *_) = known[camera], info.cameras[camera]
         if (height, width) != (robot_height, robot_width):
             yield (
-                f"its pictures of camera '{camera}' are {width} x {height}, and the robot's "
+                f"its images of camera '{camera}' are {width} x {height}, and the robot's "
                 f"{robot_width} x {robot_height}; use --robot.width={width} "
                 f"--robot.height={height}"
             )

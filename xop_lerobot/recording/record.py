@@ -1,7 +1,7 @@
-"""`xop-record`: the flags of `lerobot-record`, and this project's dataset without any detour.
+"""`xop-record`: record an `XopDataset` directly, with the flags of `lerobot-record`.
 
-What it adds: an episode ends on success, lock-step runs as fast as the machine allows, and Ctrl-C
-ends without a traceback. Example:
+It adds: an episode ends on success, lock-step runs as fast as the machine allows, and Ctrl-C ends
+without a traceback. Example:
 
     xop-record --robot.type=xop_g1 --teleop.type=xop --teleop.device.type=scripted \
         --dataset.repo_id=local/walk --dataset.root=outputs/walk --dataset.fps=25 \
@@ -63,7 +63,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class XopRecordConfig(RecordConfig):
-    """The flags of `lerobot-record`, and these."""
+    """The flags of `lerobot-record`, and additional ones."""
 
     # End an episode as soon as its task is accomplished
     stop_on_success: bool = True
@@ -73,7 +73,7 @@ class XopRecordConfig(RecordConfig):
 
 @dataclass
 class Recording:
-    """What one episode after another is recorded with.
+    """Records one episode after another.
 
     Attributes:
         config: Flags.
@@ -95,7 +95,7 @@ class Recording:
         return self.robot.config.clock == "realtime"
 
     def run(self) -> None:
-        """Record the episodes that `config` asks for."""
+        """Record the number of episodes that `config` asks for."""
         wanted = self.dataset.num_episodes + self.config.dataset.num_episodes
         while self.dataset.num_episodes < wanted and not self.events["stop_recording"]:
             log_say(f"Recording episode {self.dataset.num_episodes}", self.config.play_sounds)
@@ -107,13 +107,13 @@ class Recording:
             self.dataset.save_episode()
 
     def run_episode(self) -> None:
-        """Record one episode, until its time, its end, its success or a key."""
+        """Record one episode, until its time, task, operator or a key ends it."""
         config = self.config
         fps, duration = config.dataset.fps, config.dataset.episode_time_s
         limit = None if self.realtime else count_ticks(duration, fps)
         self.dataset.begin(self.events, limit, stop_on_success=config.stop_on_success)
         if self.realtime:
-            # The robot starts over in an observation: not on the episode's time.
+            # Resets happen inside an observation; do it before the episode's time starts.
             self.robot.get_observation()
         start = time.perf_counter()
         while not self.events["exit_early"]:
@@ -126,7 +126,7 @@ class Recording:
         self.events["exit_early"] = False
 
     def record_step(self) -> None:
-        """Observe, decide, act, record."""
+        """Record one control step."""
         config = self.config
         observation, action = record_step(
             self.robot, self.teleop, self.dataset, config.dataset.single_task
@@ -200,10 +200,10 @@ def show_data(config: XopRecordConfig) -> Iterator[None]:
 
 
 def check_types(config: XopRecordConfig) -> tuple[XopRobotConfig, XopConfig]:
-    """Return the configurations of robot and teleoperator, which must be this project's.
+    """Return the configurations of robot and teleoperator, which must be of this project.
 
     Raises:
-        BadValue: If one isn't; `lerobot-record` takes all of them.
+        BadValue: If one is not; `lerobot-record` accepts all types.
     """
     robot, teleop = config.robot, config.teleop
     if isinstance(robot, XopRobotConfig) and isinstance(teleop, XopConfig):
@@ -215,10 +215,10 @@ def check_types(config: XopRecordConfig) -> tuple[XopRobotConfig, XopConfig]:
 
 
 def open_dataset(config: XopRecordConfig, robot: "XopRobot", teleop: "Xop") -> XopDataset:
-    """Create the dataset that the flags describe, or open it to add to it.
+    """Create the dataset that the flags describe, or open it to resume.
 
     Raises:
-        XopError: If it cannot be made, or not be added to; see `XopDataset`.
+        XopError: If it cannot be created or resumed; see `XopDataset`.
     """
     flags = config.dataset
     columns = teleop.config.record.columns
@@ -254,7 +254,7 @@ def open_dataset(config: XopRecordConfig, robot: "XopRobot", teleop: "Xop") -> X
 
 
 def build_features(robot: Robot, *, use_videos: bool) -> dict[str, dict]:
-    """Build LeRobot's own features of a robot: `action`, `observation.state` and the pictures."""
+    """Build LeRobot's own features of a robot: `action`, `observation.state` and images."""
     teleop_step, _, observation_step = make_default_processors()
     return combine_feature_dicts(
         aggregate_pipeline_dataset_features(
@@ -271,13 +271,13 @@ def build_features(robot: Robot, *, use_videos: bool) -> dict[str, dict]:
 
 
 def main() -> None:
-    """Run `xop-record`; a mistake of the user's ends in one line and not in a traceback."""
+    """Run `xop-record`; a user error ends in one line instead of a traceback."""
     make_output_readable()
     register_third_party_plugins()
     try:
         record()  # pyright: ignore[reportCallIssue]  the parser makes the argument
     except KeyboardInterrupt:
-        print("stopped; the episodes that were saved stay", file=sys.stderr)
+        print("interrupted; saved episodes are kept", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except XopError as error:
         sys.exit(f"error: {error}")

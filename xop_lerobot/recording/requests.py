@@ -1,4 +1,4 @@
-"""What the operator asks of the episode that is recorded, done as keys do it."""
+"""Requests of the operator about the episode being recorded, mapped to LeRobot's key events."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from xop_lerobot.session import Tick
 
 
 class Tally:
-    """Counts, times and flags of the episode that is being recorded.
+    """Counts, times and flags of the episode being recorded.
 
     Attributes:
-        frames: Frames so far.
+        frames: Number of frames so far.
         start_time: Host clock at the first frame [s since the epoch].
         first: Performance counter at the first frame [s].
-        last: The same at the last frame [s].
-        success: Whether the task is accomplished.
-        marked: The same as the operator has marked it, None where nobody has.
-        driven: Whether somebody has driven the robot.
+        last: Performance counter at the latest frame [s].
+        success: Whether the task is accomplished, or marked so.
+        marked: Success as marked by the operator, None if unmarked.
+        driven: Whether an operator was ever engaged.
         fallen: Whether the robot fell.
-        collision: Whether it touched anything but the ground.
+        collision: Whether it touched itself, or anything but the ground.
         finished: Whether the operator's recording has played out.
-        task: The task in words.
-        settings: What was in force at the first frame.
-        changes: What came into force, or went wrong with the robot, and with which frame.
+        task: Task description.
+        settings: Settings at the first frame.
+        changes: Changes of settings and troubles of the robot, with frame and time.
     """
 
     def __init__(self) -> None:
@@ -44,14 +44,14 @@ class Tally:
         self._trouble = ""
 
     def note_changes(self, tick: Tick) -> None:
-        """Take down what came into force with the frame that is being added."""
+        """Record the changes of settings that take effect with the frame being added."""
         if self.frames == 0:
             self.settings = dict(tick.settings)
         for change in tick.changes:
             self.changes.append({"frame": self.frames, "time": tick.state.time, **change.to_dict()})
 
     def note_state(self, state: RobotState) -> None:
-        """Take down what has become of the robot by the frame that is being added."""
+        """Record falls, collisions and troubles of the robot in the frame being added."""
         self.fallen |= state.fallen
         self.collision |= state.collision
         if state.trouble and state.trouble != self._trouble:
@@ -59,15 +59,15 @@ class Tally:
         self._trouble = state.trouble
 
     def mark(self, success: bool, time: float) -> None:
-        """Take down what the operator says of the episode, at `time` [s] of the robot's clock."""
+        """Record the operator's mark of success at `time` [s] of the robot's clock."""
         self.marked = self.success = success
         self._note(max(self.frames - 1, 0), time, "operator", {"success": success})
 
     def write_mark(self, buffer: Mapping[str, Any]) -> None:
-        """Bring `next.success` in line with the operator's mark, as `xop-curate label` does.
+        """Set `next.success` to the operator's mark, as `xop-curate label` does.
 
         Args:
-            buffer: The rows of the episode that are not saved yet, by column.
+            buffer: Unsaved rows of the episode, by column.
         """
         rows = buffer.get("next.success")
         if self.marked is None or not rows:
@@ -93,21 +93,21 @@ def grant(
     paused: bool,
     time: float,
 ) -> tuple[Cue, str]:
-    """Do what is asked for, or say why not.
+    """Fulfil a request of the operator, or refuse it with a reason.
 
-    While an episode is recorded, it ends with this tick. In the pause after it, it is not saved
-    yet: it can still be marked or discarded. What nobody has driven is no episode: it does not
-    end, and a session that stops does not keep it.
+    During an episode, the episode ends with this control step. During the pause after it, it is not
+    saved yet, so it can still be marked or discarded. An episode in which nobody was engaged is
+    empty: it does not end on request, and is not kept if the session stops.
 
     Args:
-        request: What is asked for.
-        events: The events of the recording loop; they are set here.
-        tally: Of the episode.
-        paused: Whether this is the pause after the episode.
+        request: The request.
+        events: Events of the recording loop; set here.
+        tally: Counts of the episode.
+        paused: Whether this is the pause after an episode.
         time: The robot's clock [s].
 
     Returns:
-        What the operator is told: that it is done, or `Cue.REFUSED` and why not.
+        Notice for the operator: what was done, or `Cue.REFUSED` and the reason.
     """
     match request:
         case RecordingRequest.SUCCESS:
@@ -152,5 +152,5 @@ def _stop(events: MutableMapping[str, bool], tally: Tally, paused: bool) -> tupl
         return Cue.STOP, "Stop: the session ends."
     if tally.driven:
         return Cue.STOP, "Stop: the episode is saved, and the session ends."
-    events["rerecord_episode"] = True  # that is how the loops leave an episode out
+    events["rerecord_episode"] = True  # makes LeRobot's loops discard the episode
     return Cue.STOP, "Stop: the session ends. Nothing was driven in this episode: it is not kept."

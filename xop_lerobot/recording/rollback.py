@@ -1,9 +1,9 @@
-"""An episode that cannot be saved leaves the dataset as it was before.
+"""Undo an episode that could not be saved.
 
-A save makes new files of rows, pictures and metadata, and rewrites a few small ones in place. If
-the disk fills up in the middle, LeRobot leaves files without their end and a cut `info.json`, and
-writes on while it is closed: nothing loads any more. Here the new files are removed, which makes
-room too, and the small ones are put back.
+A save creates files of rows, images and metadata, and rewrites a few small ones in place. If the
+disk fills up meanwhile, LeRobot leaves truncated files and a truncated `info.json`, and continues
+writing when closed, so the dataset no longer loads. Here new files are removed, which also frees
+space, and the small ones are restored.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 _FOLDERS = ("data", "videos", "meta")
 _TEMPORARY = "tmp????????"
-"""LeRobot's directories for videos that are being encoded, in that of the dataset."""
+"""LeRobot's temporary directories for videos being encoded, inside the dataset."""
 _LITTLE = 1 << 20
-"""Room under which a disk counts as full, where only that something is missing is known [byte]."""
+"""Free space below which a full disk is assumed to be the reason for missing files [byte]."""
 
 
 class NotSaved(XopError):
@@ -35,9 +35,9 @@ class NotSaved(XopError):
 
     Args:
         root: Directory of the dataset.
-        index: Index of the episode, which is also the number of those that are whole.
-        reason: Why, in the words of the system.
-        whole: Whether the dataset is as it was before.
+        index: Index of the episode, which equals the number of complete ones.
+        reason: Reason given by the system.
+        whole: Whether the dataset is in its previous state.
     """
 
     def __init__(self, root: Path, index: int, reason: str, *, whole: bool = True) -> None:
@@ -59,7 +59,7 @@ class NotSaved(XopError):
 
 
 class Checkpoint:
-    """The files of a dataset at one moment, to which it can be put back.
+    """Snapshot of a dataset's files, for rollback.
 
     Args:
         root: Directory of the dataset.
@@ -75,7 +75,7 @@ class Checkpoint:
         self._facts_size = facts.stat().st_size if facts.exists() else 0
 
     def restore(self) -> bool:
-        """Put the files back; return whether all are as they were."""
+        """Restore the files; return whether all are restored."""
         try:
             for path in set(self._list()) - self._files:
                 path.unlink()
@@ -97,7 +97,7 @@ class Checkpoint:
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Write a file anew, so that there is always the old one or the new one, and whole."""
+    """Rewrite a file atomically: at any time there is the old or the new one, complete."""
     fresh = path.with_name(f".{path.name}.new")
     try:
         fresh.write_bytes(content)
@@ -108,10 +108,9 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def abandon_writers(dataset: LeRobotDataset) -> None:
-    """Let LeRobot close `dataset` without writing on what was begun.
+    """Make LeRobot close `dataset` without finishing its open files.
 
-    This takes private attributes of LeRobot, see the patch `ROLLBACK`; where one is missing,
-    nothing is done about it.
+    This uses private attributes of LeRobot, see the patch `ROLLBACK`; missing ones are ignored.
     """
     writer, meta = dataset.writer, dataset.meta
     if writer is not None:
@@ -127,22 +126,22 @@ def abandon_writers(dataset: LeRobotDataset) -> None:
 
 
 def _drop(parquet: Any) -> None:
-    """Close a parquet writer whose file is not wanted any more."""
+    """Close a Parquet writer whose file is discarded."""
     if parquet is None:
         return
     with suppress(Exception):
         parquet.close()
-    parquet.is_open = False  # else it is closed, and fails, again when it is collected
+    parquet.is_open = False  # else garbage collection closes it again, which fails
     with suppress(Exception):
         parquet.file_handle.close()
 
 
 @contextmanager
 def taken_back_on_failure(dataset: LeRobotDataset) -> Iterator[None]:
-    """Save an episode in the block; if that fails, close `dataset` as it was before.
+    """Save an episode in the block; on failure roll back and close `dataset`.
 
     Raises:
-        NotSaved: If the system did not write.
+        NotSaved: If the system could not write.
     """
     info = dataset.meta.info
     counts = info.total_episodes, info.total_frames
@@ -152,7 +151,7 @@ def taken_back_on_failure(dataset: LeRobotDataset) -> Iterator[None]:
     except Exception as error:
         abandon_writers(dataset)
         whole = checkpoint.restore()
-        # `dataset` may have opened others meanwhile, to close the files of the episode.
+        # `dataset` may have reopened its files meanwhile, which resets its counts.
         dataset.meta.info.total_episodes, dataset.meta.info.total_frames = counts
         dataset.finalize()
         raise_if_not_written(dataset, error, whole=whole)
@@ -160,10 +159,10 @@ def taken_back_on_failure(dataset: LeRobotDataset) -> Iterator[None]:
 
 
 def raise_if_not_written(dataset: LeRobotDataset, error: Exception, *, whole: bool = True) -> None:
-    """Say in one line that the system did not write, if that is what `error` comes from.
+    """Raise `NotSaved` if `error` was caused by a failed write.
 
     Raises:
-        NotSaved: If it is.
+        NotSaved: If it was.
     """
     reason = find_reason(error)
     if reason and not isinstance(error, NotSaved):
@@ -172,13 +171,13 @@ def raise_if_not_written(dataset: LeRobotDataset, error: Exception, *, whole: bo
 
 
 def check_pictures(dataset: LeRobotDataset, index: int) -> None:
-    """Check that the pictures of an episode are on the disk, where they go into files first.
+    """Check that the image files of an episode were written.
 
-    LeRobot's image writer only logs what it could not write, and its encoder takes what it
-    finds: the video would be shorter than the episode, and show other moments.
+    LeRobot's image writer only logs failed writes, and its encoder uses the files it finds: the
+    video would be shorter than the episode, and its images shifted.
 
     Args:
-        dataset: The dataset, with an episode that is to be saved.
+        dataset: The dataset, with an episode about to be saved.
         index: Index of the episode.
 
     Raises:
@@ -193,19 +192,19 @@ def check_pictures(dataset: LeRobotDataset, index: int) -> None:
     paths = [Path(name) for column in columns for name in column if isinstance(name, str)]
     lost = [path for path in paths if not path.is_file() or path.stat().st_size == 0]
     if lost:
-        reason = f"{len(lost)} of its {say_count(len(paths), 'picture')} could not be written"
+        reason = f"{len(lost)} of its {say_count(len(paths), 'image')} could not be written"
         if shutil.disk_usage(dataset.root).free < _LITTLE:
             reason = f"{os.strerror(errno.ENOSPC)}; {reason}"
         raise NotSaved(dataset.root, index, reason)
 
 
 def find_reason(error: BaseException | None) -> str:
-    """Say why the system did not write; empty where `error` is none of the system's."""
+    """Return why the system could not write; empty if `error` has another cause."""
     full = os.strerror(errno.ENOSPC)
     while error is not None:
         if isinstance(error, OSError):
             return os.strerror(error.errno) if error.errno else str(error).splitlines()[0]
-        if full in str(error):  # of an encoder's thread
+        if full in str(error):  # raised in an encoder's thread
             return full
         error = error.__cause__ or error.__context__
     return ""

@@ -1,9 +1,9 @@
-"""A trained policy gets pictures of the size that it was trained with.
+"""Check that a trained policy gets images of the size it was trained with.
 
-LeRobot's rollout compares names of cameras and not sizes: a policy that does not resize its
-pictures runs with others, and does badly without a word. While one of this project's robots is
-configured, `lerobot-rollout` therefore compares them before it loads or connects anything. Robots
-of others are passed through unchanged.
+LeRobot's rollout compares camera names but not image sizes: a policy that does not resize its
+images runs on others and silently performs badly. While a robot of this project is configured,
+`lerobot-rollout` therefore compares sizes before it loads or connects anything. Robots of other
+projects are not affected.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ _RESIZING = (
     "resize_shape", "image_resize_shape", "resize_imgs_with_padding", "resize_images_to",
     "image_resolution", "image_size",
 )  # fmt: skip
-"""Settings of LeRobot's policies that bring pictures of any size to one."""
+"""Settings of LeRobot's policies that resize images of any size."""
 
 
 def watch_rollouts(ours: type[XopRobotConfig]) -> Patched:
-    """Let `lerobot-rollout`, if that is what runs, check the sizes of pictures first.
+    """Make `lerobot-rollout`, if it is running, check image sizes first.
 
     Args:
-        ours: Configuration of the robots whose pictures are compared.
+        ours: Configuration class of the robots to check.
 
     Returns:
-        What is patched, which may be undone; nothing where it was before.
+        The patches, which can be undone; empty if already installed.
     """
     patched = Patched()
     if not (runs(ROLLOUT_MODULE) and fits(ROLLOUT_PICTURES)) or is_patched(ROLLOUT_PICTURES):
@@ -55,7 +55,7 @@ def watch_rollouts(ours: type[XopRobotConfig]) -> Patched:
 
     @functools.wraps(stock)
     def build(*args: Any, **kwargs: Any) -> Any:
-        """Check the pictures of an xop robot, then do what LeRobot does."""
+        """Check the images of an xop robot, then do what LeRobot does."""
         cfg = signature.bind(*args, **kwargs).arguments["cfg"]
         if isinstance(cfg.robot, ours):
             check_pictures(cfg.robot, cfg.policy, getattr(cfg, "rename_map", None) or {})
@@ -66,15 +66,15 @@ def watch_rollouts(ours: type[XopRobotConfig]) -> Patched:
 
 
 def check_pictures(robot: XopRobotConfig, policy: Any, names: dict[str, str]) -> None:
-    """Check that a policy was trained with pictures of the robot's size.
+    """Check that a policy was trained with images of the robot's size.
 
     Args:
         robot: The robot.
         policy: LeRobot's configuration of the policy.
-        names: What the policy calls a camera, by the robot's name of its column.
+        names: The policy's camera keys by the robot's, where renamed.
 
     Raises:
-        BadValue: If it was trained with others, and does not resize them itself.
+        BadValue: If it was trained with another size and does not resize images.
     """
     inputs = getattr(policy, "input_features", None) or {}
     for camera in robot.cameras:
@@ -86,7 +86,7 @@ def check_pictures(robot: XopRobotConfig, policy: Any, names: dict[str, str]) ->
         if (height, width) == (robot.height, robot.width):
             continue
         fault = (
-            f"the policy was trained with pictures of {width} x {height} of camera '{camera}', "
+            f"the policy was trained with images of {width} x {height} of camera '{camera}', "
             f"and the robot's are {robot.width} x {robot.height}"
         )
         if not any(getattr(policy, name, None) for name in _RESIZING):

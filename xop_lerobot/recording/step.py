@@ -1,4 +1,4 @@
-"""One tick of a recording: observe, decide, act, record."""
+"""One control step of a recording: observe, decide, act, record."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
 def record_step(
     robot: XopRobot, teleop: Xop, dataset: XopDataset, task: str
 ) -> tuple[dict[str, Any], dict[str, float]]:
-    """Run one tick and add its frame to the dataset.
+    """Run one control step and add its frame to the dataset.
 
     Args:
         robot: Connected robot.
         teleop: Connected teleoperator of the same session.
         dataset: Dataset to add to.
-        task: The task in words.
+        task: Task description.
 
     Returns:
-        The observation, and the action that followed from it.
+        The observation, and the action chosen from it.
     """
     features = dataset.features
     observation = robot.get_observation()

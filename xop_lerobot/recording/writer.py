@@ -1,21 +1,20 @@
-"""Episodes that survive a killed process.
+"""Durable episodes, no silently dropped video frames, and fast saves, on top of LeRobot's writers.
 
 LeRobot keeps its two parquet writers (frames, and episode metadata) open for a whole session and
 writes their footers only in `finalize`, so SIGKILL loses every episode of the session. Here both
-are closed after each save, and the dataset is put in the state of one that was just resumed: the
-next episode opens new files. This takes private attributes of LeRobot (the patch `ROTATION`);
-without them `XopDataset` finalizes and resumes instead, which uses public methods only and is
-slower.
+are closed after each save, and the dataset is put into the state of a newly resumed one: the next
+episode opens new files. This uses private attributes of LeRobot (the patch `ROTATION`); without
+them `XopDataset` finalizes and resumes instead, which uses public methods only and is slower.
 
-No video frame is lost: recording waits for the encoder in lock-step, and counts what it drops in
-real time. LeRobot's streaming encoder drops a frame when its queue stays full for 0.1 s. The row
-stays, so every later picture of the episode belongs to another moment. A simulation can wait.
-Pictures that are written to files wait in a queue without an end, so a slow disk fills the memory:
-beyond `MAX_IMAGES` of them either clock waits, and a real-time episode counts as late.
+LeRobot's streaming encoder drops a frame when its queue stays full for 0.1 s. The row remains, so
+every later image of the episode is shifted. In lock-step, recording therefore waits for the
+encoder; in real time, dropped frames are counted. Image files are written through an unbounded
+queue, so a slow disk would fill the memory: above `MAX_IMAGES` recording waits with either clock,
+and a real-time episode then counts as late.
 
-An episode is saved without LeRobot's pass over every row, where that pass has nothing to do: it
-embeds image files into the table row by row, also when a dataset has no image column but
-videos: 5 to 10 ms a frame with our columns, several seconds for an episode of half a minute.
+LeRobot embeds image files into the table row by row, even if a dataset has videos but no image
+columns. That pass is skipped then: it takes 5 to 10 ms per frame with our columns, several seconds
+for an episode of half a minute.
 """
 
 from __future__ import annotations
@@ -33,14 +32,14 @@ if TYPE_CHECKING:
 
 
 def rotate_writers(dataset: LeRobotDataset) -> None:
-    """Close the parquet files of `dataset`; the next episode begins new ones, videos too."""
+    """Close the Parquet files of `dataset`; the next episode opens new ones, and new videos."""
     writer, meta = dataset.writer, dataset.meta
     if writer is None or meta.latest_episode is None:
         return
     last = {key: value[0] for key, value in meta.latest_episode.items()}
     writer.close_writer()
     meta._close_writer()
-    # What a resumed dataset knows: the last episode alone tells which file numbers are taken.
+    # The state of a resumed dataset: the last episode defines the next free file indices.
     writer._latest_episode = None
     meta.latest_episode = None
     meta.episodes = [last]  # pyright: ignore[reportAttributeAccessIssue]
@@ -53,7 +52,7 @@ def forget_rotation(dataset: LeRobotDataset) -> None:
 
 @contextmanager
 def skip_embedding(dataset: LeRobotDataset) -> Iterator[None]:
-    """In the block, leave the table as it is if `dataset` has no image columns."""
+    """Within the block, skip embedding images if `dataset` has no image columns."""
     if dataset.meta.image_keys:
         yield
         return
@@ -67,16 +66,16 @@ def skip_embedding(dataset: LeRobotDataset) -> Iterator[None]:
 
 
 MAX_IMAGES = 256
-"""Pictures that may wait for the disk."""
+"""Largest number of images waiting for the disk."""
 _POLL_S = 0.001
 
 
 class VideoQueue:
-    """The queues of a streaming encoder, None where frames go to image files.
+    """Queues of the video encoder or of the image writer.
 
     Args:
-        encoder: LeRobot's `StreamingVideoEncoder`, or None.
-        writer: LeRobot's `DatasetWriter`, whose `image_writer` there may be none of.
+        encoder: LeRobot's `StreamingVideoEncoder`, None if frames go to image files.
+        writer: LeRobot's `DatasetWriter`, whose `image_writer` may be None.
     """
 
     def __init__(self, encoder: Any, writer: Any = None) -> None:  # private types
@@ -84,7 +83,7 @@ class VideoQueue:
         self._bounds_images = fits(IMAGES)
 
     def wait(self) -> None:
-        """Wait until every queue takes a frame; a dead encoder is left for LeRobot to report."""
+        """Wait until every queue has space; a dead encoder is left for LeRobot to report."""
         if self._encoder is None:
             return
         for key, queue in self._encoder._frame_queues.items():
@@ -92,7 +91,7 @@ class VideoQueue:
                 time.sleep(_POLL_S)
 
     def wait_for_images(self) -> None:
-        """Wait until the image files have caught up; workers that have died are left alone."""
+        """Wait until fewer than `MAX_IMAGES` are queued; dead workers are left to LeRobot."""
         images = getattr(self._writer, "image_writer", None)
         if images is None or not self._bounds_images:
             return
@@ -102,7 +101,7 @@ class VideoQueue:
 
     @property
     def dropped(self) -> int:
-        """Frames dropped in this episode, over all cameras."""
+        """Number of dropped frames in this episode, over all cameras."""
         if self._encoder is None:
             return 0
         return sum(self._encoder._dropped_frames.values())
@@ -111,17 +110,17 @@ class VideoQueue:
 def _count(queue: Any) -> int:  # of threads or of processes
     try:
         return queue.qsize()
-    except NotImplementedError:  # macOS does not count what waits for another process
+    except NotImplementedError:  # multiprocessing queues have no size on macOS
         return 0
 
 
 @contextmanager
 def keep_schedule() -> Iterator[None]:
-    """Give the calling thread its scheduling policy back afterwards.
+    """Restore the calling thread's scheduling policy afterwards.
 
-    SVT-AV1 asks for the highest real-time priority for the thread that opens it. For root, as in
-    a container, that is granted, stays, and is inherited by every process that is started from
-    then on: two that wait actively can take a small machine for themselves.
+    SVT-AV1 requests the highest real-time priority for the thread that opens it. For root, as in a
+    container, this is granted, persists, and is inherited by every process started afterwards: two
+    busy-waiting ones can then monopolise a small machine.
     """
     if not hasattr(os, "sched_getscheduler"):  # not Linux
         yield
