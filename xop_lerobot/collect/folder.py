@@ -1,15 +1,15 @@
-"""The files of a collection while it runs, so that it can be killed and go on at any moment.
+"""Files of a collection in progress, which can be killed and resumed at any moment.
 
-Until the dataset is whole, everything lies beside its directory, in `<root>.collecting`:
+Until the dataset is complete, everything is beside its directory, in `<root>.collecting`:
 
-    settings.json            what is collected; another run must ask for the same
-    lock                     held by the run that is at work
+    settings.json            settings of the collection; further runs must have the same
+    lock                     held by the running process
     attempts/000007/         a finished episode: attempt.json, and dataset/ if it is kept
-    attempts/tmp-…/          an episode under way
-    merged/                  the dataset being put together
-    previous/                the dataset that `merged` replaces, for as long as that takes
+    attempts/tmp-…/          an episode in progress
+    merged/                  the dataset being merged
+    previous/                the dataset that `merged` replaces, while it does
 
-Every step from one state to the next is one rename, after the files are on the disk.
+Every transition between states is one rename, after the files are flushed to disk.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from xop_lerobot.core.folders import (
 from xop_lerobot.recording.facts import FACTS_DIR
 
 COLLECT_FILE = FACTS_DIR / "collect.json"
-"""What a collected dataset says of its collection."""
+"""Record of its collection in a collected dataset."""
 DATASET = "dataset"
-"""Directory of an episode's own dataset in its folder."""
+"""Directory of an episode's dataset within its folder."""
 
 
 class OtherSettings(XopError):
@@ -48,8 +48,8 @@ class OtherSettings(XopError):
 
     Args:
         root: Directory of the dataset.
-        held: Settings of the collection that is there.
-        asked: Settings that were asked for.
+        held: Settings of the existing collection.
+        asked: Requested settings.
         flag: Flag that names the directory.
     """
 
@@ -75,14 +75,14 @@ class Attempt:
     """One episode, whether it is kept in the dataset or not.
 
     Attributes:
-        index: Which of the collection's episodes; with the seed it decides the content.
+        index: Index in the collection; with the seed it decides the content.
         success: Whether the task was accomplished.
-        failure: Why not, in words; empty if unknown.
+        failure: Reason of the failure; empty if unknown.
         kept: Whether it is in the dataset.
-        frames: Frames.
-        run: When the run that made it began [s since the epoch].
-        elapsed: Time from then until it was finished [s].
-        cpu_s: Time that processors worked for it [s].
+        frames: Number of frames.
+        run: Start time of the run that made it [s since the epoch].
+        elapsed: Time from the start of the run until it was finished [s].
+        cpu_s: CPU time [s].
     """
 
     index: int
@@ -96,17 +96,17 @@ class Attempt:
 
 
 class CollectFolder:
-    """A collection's files.
+    """Files of a collection.
 
     Args:
         root: Directory of the dataset that is being collected.
 
     Attributes:
         root: The same.
-        work: Directory of all that is not finished.
-        command: Command whose files these are, as it reads in an error.
+        work: Directory of everything unfinished.
+        command: Command that owns these files, for messages.
         flag: Its flag that names the directory.
-        record: File in which the dataset says how it was made.
+        record: File of the dataset that records how it was made.
     """
 
     command: ClassVar[str] = "xop-collect"
@@ -121,10 +121,10 @@ class CollectFolder:
 
     @contextmanager
     def hold(self, settings: Mapping[str, Any]) -> Iterator[None]:
-        """Check that this collection may work here, and let no other run in meanwhile.
+        """Check that this collection may use the directory, and lock it.
 
         Raises:
-            FolderTaken: If the directory holds something else, or another run is at work.
+            FolderTaken: If the directory holds something else, or is locked by another run.
             OtherSettings: If it holds a collection with other settings.
         """
         self._check_root()
@@ -135,7 +135,7 @@ class CollectFolder:
         )
         with lock_folder(self.work, refusal):
             try:
-                # `merged` was whole before the dataset was put aside.
+                # A dataset is only put aside once `merged` is complete.
                 finish_swap(self.root, self.previous, self.merged)
                 self._check_settings(settings)
                 self._clean_up()
@@ -161,7 +161,7 @@ class CollectFolder:
             )
 
     def _clean_up(self) -> None:
-        """Delete what a killed run was at: a merge, episodes under way, or its own cleaning."""
+        """Delete leftovers of a killed run: a merge, unfinished episodes, merged episodes."""
         in_dataset = (self._find(each["index"]) for each in self.read_dataset().get("attempts", ()))
         for folder in (self.merged, self.previous, *in_dataset):
             shutil.rmtree(folder, ignore_errors=True)
@@ -181,7 +181,7 @@ class CollectFolder:
         write_whole(self._settings, settings)
 
     def _is_empty(self) -> bool:
-        """Whether nothing has been collected that is not in the dataset yet."""
+        """Whether there is no finished episode outside the dataset."""
         return not self.merged.exists() and not any(self._attempts.glob("*"))
 
     def _find(self, index: int) -> Path:
@@ -190,17 +190,17 @@ class CollectFolder:
     # Episodes.
 
     def read_dataset(self) -> dict[str, Any]:
-        """Read what the finished dataset says of its collection; empty while there is none."""
+        """Read the finished dataset's record of its collection; empty without one."""
         path = self.root / self.record
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
     def list_attempts(self) -> dict[int, Attempt]:
-        """List all finished episodes by index, those in the dataset and those beside it."""
+        """List all finished episodes by index, in and outside the dataset."""
         rows = [Attempt(**row) for row in self.read_dataset().get("attempts", ())]
         return {attempt.index: attempt for attempt in rows} | self.read_attempts()
 
     def read_attempts(self) -> dict[int, Attempt]:
-        """Read the finished episodes that are not in the dataset yet, by index."""
+        """Read the finished episodes that are not merged yet, by index."""
         found = {}
         for path in sorted(self._attempts.glob("[0-9]*/attempt.json")):
             attempt = Attempt(**json.loads(path.read_text(encoding="utf-8")))
@@ -208,20 +208,20 @@ class CollectFolder:
         return found
 
     def get_dataset(self, index: int) -> Path:
-        """Return the dataset that holds the finished episode `index` alone."""
+        """Return the directory of the finished episode `index`'s own dataset."""
         return self._find(index) / DATASET
 
     def open_attempt(self, index: int) -> Path:
-        """Make the directory of episode `index`, to work in."""
+        """Create the working directory of episode `index`."""
         folder = self._attempts / f"tmp-{index:06d}-{os.getpid()}"
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         return folder
 
     def close_attempt(self, folder: Path, attempt: Attempt) -> None:
-        """Let an episode count: from now on no kill can lose it.
+        """Mark an episode as finished, so that no kill can lose it.
 
-        One without a single frame does not, and its directory goes.
+        One without frames is deleted instead.
         """
         if not attempt.frames:
             shutil.rmtree(folder)
@@ -232,10 +232,10 @@ class CollectFolder:
         sync(self._attempts)
 
     def exchange(self, indices: Iterable[int]) -> None:
-        """Put the merged dataset in the place of the one before.
+        """Replace the dataset by the merged one.
 
         Args:
-            indices: Episodes that are in it; their own files are deleted.
+            indices: Episodes in it, whose own files are deleted.
         """
         swap_in(self.merged, self.root, self.previous)
         for folder in (self.merged, self.previous, *map(self._find, indices)):

@@ -1,4 +1,4 @@
-"""Put single episodes together to one dataset, in the order of their indices."""
+"""Merge single-episode datasets into one, in the order of their indices."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def merge_attempts(
     settings: Mapping[str, Any],
     note_walls: Callable[[], Mapping[str, float]],
 ) -> None:
-    """Merge the dataset that is there, if any, and finished episodes into a new one.
+    """Merge the existing dataset, if any, and finished episodes into a new one.
 
-    As when they are recorded one after another, each episode has files of its own, and its facts
-    are in `meta/xop/episodes.jsonl`. Nothing of what was there is changed before the new dataset
-    is whole; then one takes the other's place. Without a single episode to keep, nothing happens.
+    As when recorded one after another, each episode has its own files, and its metadata is in
+    `meta/xop/episodes.jsonl`. The old dataset is replaced only when the new one is complete.
+    Without an episode to keep, nothing happens.
 
     Args:
-        folder: The collection's files.
-        indices: Episodes that are merged; others stay for another time.
+        folder: Files of the collection.
+        indices: Episodes to merge; others are kept for later.
         repo_id: Name of the dataset.
-        settings: What was collected.
-        note_walls: Tells how long each run took so far [s], by its start.
+        settings: Settings of the collection.
+        note_walls: Returns the duration of each run so far [s], by its start time.
     """
     attempts = [each for index, each in folder.read_attempts().items() if index in indices]
     before = folder.read_dataset()
@@ -69,7 +69,7 @@ def merge_attempts(
 
 
 def _merge_facts(sources: Sequence[Path], merged: Path) -> None:
-    """Take the facts on the episodes along; LeRobot merges only what is its own."""
+    """Copy the episode metadata of `meta/xop`, which LeRobot's merge ignores."""
     (merged / FACTS_DIR).mkdir(parents=True, exist_ok=True)
     shutil.copy(sources[-1] / CONFIG_FILE, merged / CONFIG_FILE)
     rows = [row for source in sources for row in read_facts(source)]
@@ -79,15 +79,15 @@ def _merge_facts(sources: Sequence[Path], merged: Path) -> None:
 
 
 def _show_nothing(things: Iterable[Any], **options: Any) -> Iterable[Any]:
-    """Stand for LeRobot's progress bars, which would be among the command's own lines."""
+    """Replacement for LeRobot's progress bars, which would mix with the command's output."""
     del options
     return things
 
 
 def _load_episodes(root: Path) -> dict[str, list]:
-    """Read the columns of a dataset's episode metadata, but for the statistics.
+    """Read the columns of a dataset's episode metadata, without statistics.
 
-    LeRobot's own goes through `datasets`, which takes a second for the 900 columns of a single
+    LeRobot's own function uses `datasets`, which takes a second for the 900 columns of a single
     episode.
     """
     tables = []

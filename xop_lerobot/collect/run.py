@@ -1,8 +1,8 @@
-"""Make the missing episodes of a dataset, and merge all of them.
+"""Make the missing episodes of a dataset in parallel, and merge all of them.
 
-Episodes are made in parallel, by processes of this machine or of a Ray cluster. A worker
-of this machine writes into the collection's folder itself. Those of a cluster need no
-common disk: their episodes come as bytes, and are written here.
+Episodes are made by processes of this machine or of a Ray cluster. A local worker writes into the
+collection's folder itself. Workers of a cluster need no shared disk: their episodes are sent as
+bytes and written here.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from xop_lerobot.collect.worker import Collector
 
 _TRIES = 2
-"""How often a worker may die over one episode before the run is given up."""
+"""Number of times a worker may die over one episode before the run is aborted."""
 _HEAVY = ("xop_lerobot.collect.worker", "mujoco", "onnxruntime")
-"""What takes the workers long to import; done once where processes can be forked."""
+"""Slow imports of the workers, done once in the parent if processes can be forked."""
 
 
 class WorkerFailed(XopError):
@@ -52,21 +52,21 @@ def make_attempts(
     run: float,
     ray: str = "",
 ) -> Generator[Attempt]:
-    """Make the episodes of `jobs` with several workers, and yield each when it counts.
+    """Make the episodes of `jobs` with several workers, and yield each when finished.
 
-    Closing the iterator ends the workers, which is safe at any moment.
+    Closing the iterator ends the workers, which is safe at any time.
 
     Args:
-        config: What is collected.
-        folder: Where to.
-        jobs: What the episodes are made from: their indices, or what `config`'s maker takes.
-        workers: Number of workers; 0 for one for each core.
-        run: When this run began [s since the epoch].
-        ray: Address of a Ray cluster that makes them; empty for processes of this machine.
+        config: Configuration of the collection.
+        folder: Files of the collection.
+        jobs: Episode indices, or the jobs that `config`'s maker takes.
+        workers: Number of workers; 0 for one per core.
+        run: Start time of this run [s since the epoch].
+        ray: Address of a Ray cluster; empty for processes of this machine.
 
     Raises:
-        WorkerFailed: If an episode raises, or its worker dies again.
-        XopError: If the cluster is not there, or not like this machine.
+        WorkerFailed: If an episode raises, or its worker dies `_TRIES` times.
+        XopError: If the cluster cannot be reached, or differs from this machine.
     """
     if ray:
         from xop_lerobot.core.pool_ray import run_jobs_on_ray  # noqa: PLC0415 optional
@@ -74,9 +74,9 @@ def make_attempts(
         ship = _Ship(config, run)
         results = run_jobs_on_ray(ship, jobs, workers, address=ray, tries=_TRIES)
     else:
-        crew = workers or len(os.sched_getaffinity(0))
+        count = workers or len(os.sched_getaffinity(0))
         save = _Save(config, run, folder)
-        results = run_jobs(save, jobs, crew, tries=_TRIES, preload=_HEAVY)
+        results = run_jobs(save, jobs, count, tries=_TRIES, preload=_HEAVY)
     with closing(results):
         for result in results:
             index = get_index(result.job)
@@ -89,26 +89,26 @@ def make_attempts(
 
 
 def get_index(job: Any) -> int:
-    """Return the index of the episode that a job makes; the job may be that index itself."""
+    """Return the episode index of a job, which may be the index itself."""
     return job if isinstance(job, int) else job.index
 
 
 @dataclasses.dataclass
 class _Job:
-    """Makes episodes in a worker and reuses the robot between them."""
+    """Makes episodes in a worker process; the robot is reused between them."""
 
     config: CollectConfig
     run: float
 
     @cached_property
     def maker(self) -> Collector:
-        """What makes them."""
+        """The maker of the episodes, created on first use in the worker."""
         return resolve_name(self.config.maker)(self.config, self.run)
 
 
 @dataclasses.dataclass
 class _Save(_Job):
-    """Writes them into the collection's folder."""
+    """Writes episodes into the collection's folder."""
 
     folder: CollectFolder
 
@@ -121,21 +121,21 @@ class _Save(_Job):
 
 
 class _Ship(_Job):
-    """Returns their files, packed."""
+    """Returns the files of episodes as a tar archive."""
 
     def __call__(self, job: Any) -> tuple[Attempt, bytes]:
         maker = self.maker
         with tempfile.TemporaryDirectory(prefix="xop-episode-") as draft:
             attempt = maker.make(job, Path(draft))
             packed = io.BytesIO()
-            # Not compressed: parquet and video are already.
+            # Not compressed: Parquet and video already are.
             with tarfile.open(fileobj=packed, mode="w") as archive:
                 archive.add(draft, arcname=".")
         return attempt, packed.getvalue()
 
 
 def _unpack(folder: CollectFolder, attempt: Attempt, packed: bytes) -> Attempt:
-    """Write an episode received from another machine, and mark it as finished."""
+    """Unpack an episode from another machine, and mark it as finished."""
     attempt = dataclasses.replace(attempt, elapsed=time.time() - attempt.run)
     draft = folder.open_attempt(attempt.index)
     with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
@@ -149,8 +149,8 @@ class Collection:
     """Outcome of a collection.
 
     Attributes:
-        attempts: Episodes of the dataset and all that were asked for.
-        wall_s: Time that all runs took, each killed one until its last finished episode [s].
+        attempts: Episodes of the dataset and all that were requested.
+        wall_s: Duration of all runs, each killed one until its last finished episode [s].
     """
 
     attempts: tuple[Attempt, ...]
@@ -171,15 +171,14 @@ def run_collection(
     """Make the missing episodes, and merge all into one dataset.
 
     Args:
-        config: What is collected.
-        folder: Where to.
-        indices: Which episodes there shall be.
+        config: Configuration of the collection.
+        folder: Files of the collection.
+        indices: Episodes that the dataset should have.
         repo_id: Name of the dataset; empty for `local/` and the directory's name.
-        workers: Number of workers; 0 for one for each core.
+        workers: Number of workers; 0 for one per core.
         ray: Address of a Ray cluster; empty for processes of this machine.
-        quiet: Whether to show no progress.
-        make_jobs: Makes jobs for those of the indices that are missing, as `config`'s maker
-            takes them.
+        quiet: Whether to hide the progress.
+        make_jobs: Makes the jobs for missing indices that `config`'s maker takes.
 
     Raises:
         XopError: If the directory is taken, or an episode fails.
@@ -189,7 +188,7 @@ def run_collection(
     with folder.hold(settings):
         done = folder.list_attempts()
         missing = [index for index in indices if index not in done]
-        # Closed at once, whatever happens: no worker may outlive the hold on the folder.
+        # `closing`: no worker may outlive the lock on the folder.
         made = make_attempts(config, folder, make_jobs(missing), workers, begin, ray)
         with _Progress(config, len(missing), quiet=quiet) as progress, closing(made):
             if done:
@@ -228,19 +227,19 @@ def _compute_walls(folder: CollectFolder, attempts: dict[int, Attempt]) -> dict[
 
 
 class _Progress:
-    """Reports progress on standard error: a line per episode, and a bar on a terminal.
+    """Reports progress on stderr: a line per episode, and a bar on a terminal.
 
     Args:
         config: What is collected.
-        missing: How many episodes are still to be made.
-        quiet: Whether to say nothing.
+        missing: Number of episodes to make.
+        quiet: Whether to print nothing.
     """
 
     def __init__(self, config: CollectConfig, missing: int, *, quiet: bool) -> None:
         self._config, self._missing, self._quiet = config, missing, quiet
         self._start = time.perf_counter()
         self._made = self._frames = self._successes = 0
-        # None: no bar where standard error is no terminal.
+        # None: hide the bar if stderr is not a terminal.
         self._bar = tqdm(total=missing, unit="episode", disable=quiet or None, leave=False)
 
     def __enter__(self) -> Self:

@@ -1,9 +1,9 @@
-"""One worker of `xop-collect`: robot, simulated operator and one dataset for each episode.
+"""Worker of `xop-collect`: robot, simulated operator, and one dataset per episode.
 
-The robot and the teleoperator are the LeRobot devices that `lerobot-record` uses, run in
-lock-step, and the frames go through the same `XopDataset`. The teleoperator is made anew for each
-episode, which takes a few hundredths of a second, and the robot starts over with a seed made of
-the collection's and the episode's index: an episode can't depend on those before it.
+Robot and teleoperator are the LeRobot devices that `lerobot-record` uses, in lock-step, and frames
+go through the same `XopDataset`. The teleoperator is created for each episode, which takes a few
+hundredths of a second, and the robot is reset with a seed made of the collection's seed and the
+episode's index: an episode cannot depend on those before it.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
     from xop_lerobot.tasks.task import Task
 
 _GRACE_S = 10.0
-"""How long after a task's own time limit an episode is ended all the same [s]."""
+"""Time over the task's limit after which an episode is ended anyway [s]."""
 _QUEUE = 60
-"""Pictures that may wait for the encoder; lock-step waits when it is full."""
+"""Length of the encoder's queue [images]; lock-step waits when it is full."""
 
 
 class Collector:
     """Makes single episodes of a collection, in any order.
 
     Args:
-        config: What is collected.
-        run: When this run began [s since the epoch].
+        config: Configuration of the collection.
+        run: Start time of this run [s since the epoch].
     """
 
     def __init__(self, config: CollectConfig, run: float) -> None:
@@ -61,8 +61,8 @@ class Collector:
         """Make an episode.
 
         Args:
-            job: The episode: its index, or what has one.
-            folder: Directory of its own; the episode is the dataset `DATASET` in it.
+            job: The episode: its index, or an object with an `index`.
+            folder: Folder of the episode; its dataset is `DATASET` in it.
         """
         cpu = time.process_time()
         index = get_index(job)
@@ -114,7 +114,7 @@ class Collector:
         )
 
     def _run(self, job: Any, teleop: Xop, dataset: XopDataset) -> int:
-        """Run the episode until task, operator or time limit ends it; return its frames."""
+        """Run the episode until task, operator or time limit ends it; return its length."""
         self.session.begin_episode(get_index(job))
         events = {"exit_early": False}
         dataset.begin(events, self.get_limit(job))
@@ -133,7 +133,7 @@ class Collector:
         tick = self.session.tick
         return None if tick is None else tick.outcome
 
-    # What depends on the kind of collection.
+    # Hooks for other kinds of collection.
 
     def begin(self, job: Any, teleop: Xop, dataset: XopDataset) -> None:
         """Prepare the first frame of an episode."""
