@@ -1,6 +1,6 @@
-"""Checks of `xop-doctor` on this machine and what is installed; each returns a finding with advice.
+"""Checks of `xop-doctor` on this machine and its installation; each returns a finding.
 
-What may crash or hang (a driver, a plugin) runs in a Python of its own.
+Anything that may crash or hang (a driver, a plugin) runs in a child process.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ print(f"{took * 1e3:.1f}|{name}")
 
 
 def check_gl(setup: Setup) -> Finding:
-    """Render a ball in a separate process, which a faulty driver may crash."""
+    """Render a sphere in a child process, which a faulty driver may crash."""
     del setup
     answer = run_child(_CODE)
     tried = ", ".join(choose_backends()) or "none"
@@ -85,7 +85,7 @@ ENOUGH_GB, LEAST_GB = 10.0, 1.0
 
 
 def check_disk(setup: Setup) -> Finding:
-    """Check the disk of the folder, or of its nearest existing parent."""
+    """Check free space at the folder, or at its nearest existing parent."""
     wanted = setup.root.expanduser().absolute()
     folder = wanted
     while not folder.exists():
@@ -112,11 +112,11 @@ def check_disk(setup: Setup) -> Finding:
 
 STEPS, WARMUP = 40, 10
 SHARE = 0.8
-"""A planner that needs more of its period leaves too little to the rest."""
+"""Share of the period above which the planner leaves too little time for the rest."""
 
 
 def check_cpu(setup: Setup) -> Finding:
-    """Time the planner of the robot, and compare with its period."""
+    """Time the robot's planner and compare it with its period."""
     from xop_lerobot.core.command import Mode  # noqa: PLC0415
     from xop_lerobot.evaluation.bench import BenchConfig, run_bench  # noqa: PLC0415  MuJoCo
 
@@ -161,7 +161,7 @@ DISTRIBUTION = "lerobot_teleoperator_xop"
 
 
 def check_interpreter(setup: Setup) -> Finding:
-    """Compare Python and its packages with what the installed distribution asks for."""
+    """Check Python and its packages against the requirements of the installed distribution."""
     del setup
     here = f"Python {platform.python_version()} in {sys.prefix}"
     try:
@@ -189,7 +189,7 @@ def check_interpreter(setup: Setup) -> Finding:
 
 
 def find_faults(requirements: list[str]) -> list[str]:
-    """List unfulfilled requirements of this Python, without extras."""
+    """List unmet requirements of this Python, without extras."""
     faults = []
     for each in requirements:
         requirement = Requirement(each)
@@ -226,10 +226,7 @@ print(json.dumps({"robots": sorted(RobotConfig.get_known_choices()),
 
 
 def check_plugin(setup: Setup) -> Finding:
-    """List LeRobot's types as its commands do, and check what is patched in it.
-
-    In a separate process.
-    """
+    """Check in a child process that LeRobot lists this project's types and fits every patch."""
     del setup
     answer = run_child(_PLUGIN_CODE, timeout=300.0)
     if not answer.ok:

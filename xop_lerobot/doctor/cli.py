@@ -1,10 +1,10 @@
-"""`xop-doctor`: checks whether this machine is ready, and says what to fix.
+"""`xop-doctor`: check whether this machine is ready for teleoperation, and advise on fixes.
 
     xop-doctor                                        the machine alone
-    xop-doctor --device avp --host 192.168.1.40       and a Vision Pro, as it streams now
-    xop-doctor --device webxr --host 0.0.0.0          and any other headset, once it has the page
+    xop-doctor --device avp --host 192.168.1.40       and a streaming Vision Pro
+    xop-doctor --device webxr --host 0.0.0.0          and any other headset with the page open
 
-Exit status: 0 if nothing fails, 1 if something does, 2 for a mistake in the command line.
+Exit status: 0 if no check fails, 1 if one does, 2 for an invalid command line.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ CHECKS: dict[str, Callable[[Setup], Finding]] = {
     "headset": check_headset,
     "cpu": check_cpu,
 }
-"""Checks by name, in their order."""
+"""Checks by name, in the order in which they run."""
 DEVICES = ("avp", "webxr")
 
 
 def run_checks(setup: Setup, names: Sequence[str] = tuple(CHECKS)) -> Iterator[tuple[str, Finding]]:
-    """Run the checks `names` one after another; a crash counts as a failure."""
+    """Run the checks `names` one after another; an exception counts as a failure."""
     for name in names:
         try:
             yield name, CHECKS[name](setup)
-        except Exception as error:  # whatever it is, the other checks go on
+        except Exception as error:  # one broken check must not stop the others
             kind = "" if isinstance(error, XopError) else f"{type(error).__name__}: "
             yield name, Finding(Level.FAIL, f"{kind}{error}")
 
@@ -61,14 +61,19 @@ def make_parser() -> CommandParser:
     add("--device", default="", help="headset: avp or webxr (default: none)")
     add("--host", default="", help="avp: its address; webxr: address to listen at (default: "
         "127.0.0.1)")  # fmt: skip
-    add("--port", type=int, default=0, help="its port (default: avp 12345, webxr 8012)")
+    add(
+        "--port",
+        type=int,
+        default=0,
+        help="its port (default: avp 12345, webxr 8012)",
+    )
     add("--seconds", type=float, default=default.seconds,
         help=f"duration of the stream measurement [s] (default: {default.seconds:g})")  # fmt: skip
     add("--wait", type=float, default=default.wait,
-        help=f"time to wait for it [s] (default: {default.wait:g})")  # fmt: skip
+        help=f"time to wait for the stream [s] (default: {default.wait:g})")  # fmt: skip
     add("--robot", default=default.robot, help="robot whose planner is timed (default: g1)")
     add("--mode", default=default.mode, help="mode of the planner (default: stationary)")
-    add("--root", type=Path, default=None, help="where datasets go (default: LeRobot's folder)")
+    add("--root", type=Path, default=None, help="folder of datasets (default: LeRobot's)")
     add(
         "--only",
         default="",
@@ -79,7 +84,7 @@ def make_parser() -> CommandParser:
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[Setup, tuple[str, ...], bool]:
-    """Read the command line: what is wanted, the checks, and whether as JSON.
+    """Read the command line: the setup, the checks to run, and whether to print JSON.
 
     Raises:
         BadValue: If a flag is malformed or out of its range.
@@ -109,7 +114,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Setup, tuple[str, ...], b
 
 
 def find_root() -> Path:
-    """LeRobot's folder of datasets, as LeRobot itself finds it, without loading it."""
+    """Return LeRobot's dataset folder, resolved as LeRobot does but without importing it."""
     home = os.environ.get("HF_LEROBOT_HOME")
     if home:
         return Path(home).expanduser()
@@ -134,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     findings = []
-    # A headset's page prints its address, which is no part of the object.
+    # The WebXR server prints its address to stdout; keep it out of the JSON object.
     with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
         for name, finding in run_checks(setup, names):
             findings.append((name, finding))

@@ -1,4 +1,4 @@
-"""What a check of `xop-doctor` is given and returns, and a Python of its own for what may hang."""
+"""Types of `xop-doctor`'s checks: setup and finding; and a child process for what may hang."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ class Answer(NamedTuple):
     """Result of a child process."""
 
     ok: bool
-    """Whether it has ended well."""
+    """Whether it exited with status 0."""
     text: str
-    """What it has printed, or the last line of why not."""
+    """Its output, or the last line of its error."""
 
 
 def run_child(code: str, *arguments: str, timeout: float = 120.0) -> Answer:
-    """Run `code` with `arguments` in `sys.argv[1:]`.
+    """Run `code` in a child process, with `arguments` in `sys.argv[1:]`.
 
     Args:
-        code: The program.
-        arguments: What it is given.
-        timeout: It is ended after so long [s].
+        code: Python program.
+        arguments: Its arguments.
+        timeout: Time after which it is killed [s].
     """
     try:
         done = subprocess.run(
@@ -64,10 +64,10 @@ class Finding:
     """Result of a check.
 
     Attributes:
-        level: How well it is.
-        text: What was found, in a sentence.
-        advice: What to do about it; empty where there is nothing to do.
-        figures: The same in numbers, fit for JSON.
+        level: Severity of the finding.
+        text: Result, in one sentence.
+        advice: What to do about it; empty if nothing.
+        figures: Measured values, as plain values for JSON.
     """
 
     level: Level
@@ -81,14 +81,14 @@ class Setup:
     """Intended use of this machine.
 
     Attributes:
-        device: The headset, `avp` or `webxr`; empty for none.
-        host: `avp`: its address. `webxr`: address to listen at; empty is loopback.
-        port: Its port, 0 for the usual one.
-        seconds: How long its stream is measured [s].
-        wait: How long it is waited for [s].
+        device: Headset, `avp` or `webxr`; empty for none.
+        host: `avp`: its address. `webxr`: address to listen at; empty for loopback.
+        port: Port; 0 for the default.
+        seconds: Duration of the stream measurement [s].
+        wait: Time to wait for the stream [s].
         robot: Robot whose planner is timed.
-        mode: In which mode.
-        root: Where datasets are written.
+        mode: Mode of the planner.
+        root: Folder of datasets.
     """
 
     device: str = ""

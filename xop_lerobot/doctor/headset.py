@@ -1,4 +1,4 @@
-"""Checks of `xop-doctor` on the way to a headset: certificate, ports, and its stream."""
+"""Checks of `xop-doctor` on the headset: certificate, ports, and stream quality."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from xop_lerobot.doctor.finding import Finding, Level, Setup
 
 
 def check_certificate(setup: Setup) -> Finding:
-    """Check the certificate without changing it."""
+    """Check the TLS certificate without changing it."""
     if setup.device == "avp":
         return Finding(Level.SKIP, "a Vision Pro with Tracking Streamer needs none")
     if setup.host in ("", "127.0.0.1", "localhost", "::1"):
@@ -44,18 +44,18 @@ TIMEOUT_S = 3.0
 
 
 def check_ports(setup: Setup) -> Finding:
-    """Listen on the page's port, or connect to that of a Vision Pro."""
-    # Where the protocols are not installed, this check fails alone.
+    """Open the page's port on this machine, or connect to that of a Vision Pro."""
+    # Imported here: if the protocols' packages are missing, only this check fails.
     from xop_lerobot.operator.devices import avp as avp_protocol  # noqa: PLC0415
     from xop_lerobot.operator.webxr import protocol as webxr_protocol  # noqa: PLC0415
 
     if setup.device == "avp":
-        return _knock(setup.host, setup.port or avp_protocol.PORT)
+        return _check_connection(setup.host, setup.port or avp_protocol.PORT)
     host = setup.host or "127.0.0.1"
-    return _listen(host, setup.port or webxr_protocol.PORT)
+    return _check_free_port(host, setup.port or webxr_protocol.PORT)
 
 
-def _listen(host: str, port: int) -> Finding:
+def _check_free_port(host: str, port: int) -> Finding:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -66,13 +66,13 @@ def _listen(host: str, port: int) -> Finding:
         return Finding(
             Level.FAIL,
             f"port {port} at {host} cannot be opened: {error.strerror or error}",
-            "end the other program (another session of ours?), or choose another port with "
+            "end the other program (another session?), or choose another port with "
             "--teleop.device.port; the address must be one of this machine's",
         )
     return Finding(Level.OK, f"port {port} at {host} is free for the page of a headset")
 
 
-def _knock(host: str, port: int) -> Finding:
+def _check_connection(host: str, port: int) -> Finding:
     if not host:
         return Finding(Level.FAIL, "no address of a Vision Pro", "pass --host ADDRESS")
     try:
@@ -89,11 +89,11 @@ def _knock(host: str, port: int) -> Finding:
 
 GOOD_HZ, LEAST_HZ = 50.0, 25.0
 SLOW_S = 0.1
-"""Who drives with a delay of more than this feels it [s]."""
+"""Delay above which an operator notices it [s]."""
 
 
 def check_headset(setup: Setup) -> Finding:
-    """Connect, and measure the stream; for a page, wait until it is opened."""
+    """Connect and measure the stream; for a page, wait until it is opened."""
     if not setup.device:
         return Finding(
             Level.SKIP, "no headset was named", "pass --device avp --host ADDRESS, or webxr"
