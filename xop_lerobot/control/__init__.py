@@ -1,1 +1,1 @@
-"""Changes of settings from outside: a local socket, its client, and keys of the terminal."""
+"""Changing settings at runtime: a local socket, its client, and terminal keys."""

@@ -3,7 +3,7 @@
 xop-control --preset conservative --weights position=2 orientation=0.5
 xop-control --targets left_wrist --constraints upright=on
 xop-control --toggle upright
-xop-control                      # what is in force
+xop-control                      # show the settings
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ class ControlClient:
         self._lines = self._socket.makefile("rb")
 
     def request(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Send a request; return the settings that hold from the next tick on.
+        """Send a request; return the settings that apply from the next tick on.
 
         Raises:
-            Refused: If it is refused; says why.
+            Refused: If it is refused; the message gives the reason.
             NoSession: If the session has ended meanwhile.
         """
         try:
@@ -93,7 +93,7 @@ def build_request(flags: argparse.Namespace) -> dict[str, Any]:
     """Build the request from the flags.
 
     Raises:
-        BadValue: If a pair is none, or a value neither a number nor a switch where it must be.
+        BadValue: If a pair is malformed, or a value is not the number or switch it must be.
     """
     request: dict[str, Any] = {
         name: getattr(flags, name)
@@ -134,15 +134,15 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--variant", help="named binding of the robot, such as v2")
     parser.add_argument("--targets", nargs="+", help="tracked frames to follow")
     parser.add_argument(
-        "--body", nargs="*", help="commands and arm joints that move for them; none: all commands"
+        "--body", nargs="*", help="commands and arm joints the planner may move; none: all commands"
     )
     parser.add_argument("--mode", help="stationary or mobile")
-    parser.add_argument("--toggle", help="mode, a constraint, or a preset against default")
+    parser.add_argument("--toggle", help="toggle mode, a constraint, or a preset against default")
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run `xop-control`; a refusal ends in one line and status 1."""
+    """Run `xop-control`; a refusal exits with one line and status 1."""
     make_output_readable()
     flags = make_parser().parse_args(arguments)
     try:
@@ -159,12 +159,12 @@ if __name__ == "__main__":
     main()
 
 
-_log = PacedLog(logging.getLogger(__name__))  # a key that is held down repeats
+_log = PacedLog(logging.getLogger(__name__))  # a held key repeats
 
 PRESET_KEYS = {"d": "default", "c": "conservative", "a": "aggressive", "t": "table1"}
 TOGGLE_KEYS = {"m": "mode", "u": "upright"}
 HELP = "d/c/a/t: preset default, conservative, aggressive, table1; u: upright; m: mode"
-"""What the keys do. LeRobot's own are n, r, q, the arrows and Esc."""
+"""Help on the keys. LeRobot's own are n, r, q, the arrows and Esc."""
 
 
 class Target(Protocol):
@@ -175,7 +175,7 @@ class Target(Protocol):
         ...
 
     def toggle(self, name: str, source: str = "call") -> dict[str, Any]:
-        """Toggle one."""
+        """Toggle a setting."""
         ...
 
 

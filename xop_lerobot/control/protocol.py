@@ -1,8 +1,8 @@
-"""Protocol of the control socket: one JSON object per line, and one line as answer.
+"""Protocol of the control socket: one JSON object per line, answered by one line.
 
 A request is a change in the form of `parse_change`, `{"toggle": name}`, or `{"get": "settings"}`.
-The answer is `{"ok": true, "settings": {...}}`, the settings that hold from the next tick on, or
-`{"ok": false, "error": "..."}`.
+The answer is `{"ok": true, "settings": {...}}` with the settings that apply from the next tick on,
+or `{"ok": false, "error": "..."}`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Changeable(Protocol):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The present settings."""
+        """Current settings."""
         ...
 
     def change(self, change: Mapping[str, Any], source: str = "call") -> dict[str, Any]:
@@ -36,7 +36,7 @@ class Changeable(Protocol):
         ...
 
     def toggle(self, name: str, source: str = "call") -> dict[str, Any]:
-        """Toggle one."""
+        """Toggle a setting."""
         ...
 
 
@@ -48,7 +48,7 @@ def find_socket(control: str, session: str) -> Path | None:
     """Find the path of the control socket.
 
     Args:
-        control: Empty, `false`, `off`, `no` or `none` for none; `true`, `on` or `yes` for the
+        control: Empty, `false`, `off`, `no` or `none` for no socket; `true`, `on` or `yes` for the
             session's path in the user's runtime directory; or a path.
         session: Name of the session.
 
@@ -56,7 +56,7 @@ def find_socket(control: str, session: str) -> Path | None:
         The path; None for no socket.
 
     Raises:
-        BadValue: If the path is longer than a socket's may be, or the session is no file name.
+        BadValue: If the path is too long for a socket, or the session name is not a file name.
     """
     if control.lower() in _OFF:
         return None
@@ -74,7 +74,7 @@ def find_socket(control: str, session: str) -> Path | None:
 
 
 def find_runtime_dir() -> Path:
-    """The directory of this user's sockets; nobody else may enter it."""
+    """Directory of this user's sockets, private to the user."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime and Path(runtime).is_dir():
         return Path(runtime) / "xop"
@@ -85,7 +85,7 @@ def answer(line: bytes, target: Changeable) -> dict[str, Any]:
     """Execute a request, and return the answer.
 
     Raises:
-        NotJson: If `line` is no JSON object.
+        NotJson: If `line` is not a JSON object.
     """
     request = read_object(line)
     try:
@@ -103,10 +103,10 @@ def answer(line: bytes, target: Changeable) -> dict[str, Any]:
 
 
 def read_object(line: bytes) -> dict[str, Any]:
-    """Read one line.
+    """Parse one line.
 
     Raises:
-        NotJson: If it is no JSON object.
+        NotJson: If it is not a JSON object.
     """
     try:
         request = json.loads(line)
@@ -118,7 +118,7 @@ def read_object(line: bytes) -> dict[str, Any]:
 
 
 def write_object(values: Mapping[str, Any]) -> bytes:
-    """Write one line."""
+    """Serialise one line."""
     return json.dumps(values).encode() + b"\n"
 
 

@@ -1,4 +1,4 @@
-"""Control socket: other programs of the same user change settings while a robot runs."""
+"""Control socket: lets other programs of the same user change settings at runtime."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ logger = logging.getLogger(__name__)
 
 _MAX_CLIENTS = 8
 _MAX_RATE = 100.0
-"""Requests and connections that are taken in a second, all clients together [Hz]."""
+"""Accepted requests and connections per second, over all clients [Hz]."""
 _BURST = 50
-"""So many at once are taken without a wait."""
-_IDLE_S = 300.0  # a client that is silent for so long is let go [s]
+"""Number of requests accepted at once without a wait."""
+_IDLE_S = 300.0  # a client silent for longer is disconnected [s]
 
 
 class ControlFault(XopError):
-    """The control socket can't be opened."""
+    """The control socket cannot be opened."""
 
 
 class ControlServer:
-    """Listens on a Unix domain socket that only its user may open.
+    """Serves a Unix domain socket that only its user may open.
 
-    Nothing but JSON is read, a line of at most `MAX_LINE` bytes at a time; who sends anything
-    else is disconnected. Requests are answered in the order in which they come in, each client
-    in a thread of its own. However fast they ask, `_MAX_RATE` is all that is taken, so that the
-    robot's own loop has its share of the processor; who asks faster waits for the answers.
+    Only JSON is accepted, lines of at most `MAX_LINE` bytes; a client that sends anything else is
+    disconnected. Each client has its own thread. Requests of all clients together are limited to
+    `_MAX_RATE`, so that the robot's control loop keeps its share of the processor; faster clients
+    wait for their answers.
 
     Args:
         path: Path of the socket.
-        target: What requests are for.
+        target: Receiver of the requests.
 
     Raises:
-        ControlFault: If another session listens there, or the path can't be used.
+        ControlFault: If another session listens there, or the path cannot be used.
     """
 
     def __init__(self, path: Path, target: Changeable) -> None:
@@ -55,7 +55,7 @@ class ControlServer:
         self._clients: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._running = True
-        self._due = 0.0  # when the next request would be taken if all came evenly [s]
+        self._due = 0.0  # when the next request is due at an even rate [s]
         self._log = PacedLog(logger)
         self._socket = open_socket(path)
         self._inode = path.stat().st_ino
@@ -64,7 +64,7 @@ class ControlServer:
         logger.info("Settings can be changed at %s (xop-control).", path)
 
     def close(self) -> None:
-        """Disconnect everybody and remove the socket; may be called twice."""
+        """Disconnect all clients and remove the socket; may be called twice."""
         with self._lock:
             if not self._running:
                 return
@@ -75,7 +75,7 @@ class ControlServer:
             _shut(client)
         self._thread.join(timeout=5)
         try:
-            if self.path.stat().st_ino == self._inode:  # not that of a session after this one
+            if self.path.stat().st_ino == self._inode:  # not the socket of a later session
                 self.path.unlink()
         except FileNotFoundError:
             pass
@@ -109,14 +109,14 @@ class ControlServer:
                     if not self._reply(client, line):
                         return
         except OSError:
-            pass  # gone, or silent for too long
+            pass  # disconnected, or silent for too long
         finally:
             with self._lock:
                 self._clients.discard(client)
             _shut(client)
 
     def _wait_turn(self) -> None:
-        """Wait until one more request may be taken."""
+        """Wait until the rate limit admits one more request."""
         with self._lock:
             now = time.monotonic()
             self._due = max(self._due, now - _BURST / _MAX_RATE) + 1 / _MAX_RATE
@@ -125,7 +125,7 @@ class ControlServer:
             time.sleep(wait)
 
     def _reply(self, client: socket.socket, line: bytes) -> bool:
-        """Answer one line; return whether the client may go on."""
+        """Answer one line; return whether the client stays connected."""
         if len(line) > MAX_LINE:
             fault = f"a request may have {MAX_LINE} bytes"
             _send(client, {"ok": False, "error": fault})
@@ -143,10 +143,10 @@ class ControlServer:
 
 
 def open_socket(path: Path) -> socket.socket:
-    """Listen at `path`, with access for this user alone.
+    """Listen at `path`, accessible to this user only.
 
     Raises:
-        ControlFault: If somebody listens there already, or it can't be used.
+        ControlFault: If another process listens there, or it cannot be used.
     """
     try:
         _make_private(path.parent)
@@ -165,7 +165,7 @@ def open_socket(path: Path) -> socket.socket:
 
 
 def _make_private(folder: Path) -> None:
-    """Make the folder of the sockets if it is not there; only its user may enter it."""
+    """Create the sockets' folder if missing, accessible to its user only."""
     try:
         folder.mkdir(parents=True, mode=0o700)
     except FileExistsError:
@@ -179,7 +179,7 @@ def _make_private(folder: Path) -> None:
 
 
 def _remove_stale(path: Path) -> None:
-    """Remove the socket of a session that has ended without doing so."""
+    """Remove the socket that a crashed session has left."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise ControlFault(f"control socket '{path}': there is a file of that name")
@@ -202,7 +202,7 @@ def _send(client: socket.socket, reply: dict) -> None:
     try:
         client.sendall(write_object(reply))
     except OSError:
-        pass  # gone
+        pass  # disconnected
 
 
 def _shut(connection: socket.socket) -> None:
