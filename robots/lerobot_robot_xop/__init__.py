@@ -1,7 +1,7 @@
 """LeRobot robots `xop_g1`, `xop_rby1` and `xop_rby1m`, driven by whole-body commands.
 
-Importing this package registers the configurations alone. The device classes bring MuJoCo, so
-they are loaded when they are first asked for.
+Importing this package only registers the configurations. The device classes import MuJoCo, so they
+are loaded on first access.
 """
 
 from __future__ import annotations
@@ -39,6 +39,6 @@ _DEVICES = ("XopG1", "XopRby1", "XopRby1M", "XopRobot")
 def __getattr__(name: str) -> object:
     if name not in _DEVICES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from lerobot_robot_xop import xop_robot  # noqa: PLC0415  brings MuJoCo
+    from lerobot_robot_xop import xop_robot  # noqa: PLC0415  imports MuJoCo
 
     return getattr(xop_robot, name)

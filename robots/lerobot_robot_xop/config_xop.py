@@ -1,4 +1,4 @@
-"""Configurations of the robots. Loads neither MuJoCo nor anything of LeRobot's own weight."""
+"""Configurations of the robots. Imports neither MuJoCo nor heavy parts of LeRobot."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from xop_lerobot.tasks.heights import parse_heights
 from xop_lerobot.tasks.task import get_task
 
 POLICY_HZ = 50
-"""Rate of every low-level policy [Hz]; the control loop's rate divides it."""
+"""Rate of every low-level policy [Hz]; the control rate must divide it."""
 CLOCKS = ("lockstep", "realtime")
 
 
 @dataclass
 class SceneConfig:
-    """What is simulated around the robot, and how its sensors err."""
+    """Scene of the simulation, and sensor noise."""
 
-    scene: str = ""  # name of the scene that the robot stands in; the task's own, or empty
+    scene: str = ""  # name of the scene; default: the task's own, or empty
     noise: str = "off"  # sensor noise: off, mild or harsh
-    sensors: NoiseConfig = field(default_factory=NoiseConfig)  # single numbers over the preset's
-    viewer_port: int = 8012  # port of the browser view, where there is no display
+    sensors: NoiseConfig = field(default_factory=NoiseConfig)  # values that override the preset's
+    viewer_port: int = 8012  # port of the browser viewer, used without a display
 
     def __post_init__(self) -> None:
-        """Take the words back that YAML took for something else: `off` is a name here."""
+        """Restore words that YAML parsed as other types, such as `off`."""
         if self.noise is not None:
             self.noise = find_word(self.noise, NOISE_PRESETS)
         fill_nulls(self)
@@ -38,32 +38,32 @@ class SceneConfig:
 
 @dataclass
 class LowLevelConfig:
-    """The policy that turns whole-body commands into motor targets."""
+    """Policy that turns whole-body commands into motor targets."""
 
-    name: str = "default"  # policy; default is the robot's own
-    path: str | None = None  # the policy's file, where it takes one
+    name: str = "default"  # policy; default: the robot's own
+    path: str | None = None  # the policy's file, if it takes one
 
     def __post_init__(self) -> None:
-        """Take the words back that YAML took for something else."""
+        """Restore words that YAML parsed as other types."""
         fill_nulls(self)
 
 
 @dataclass(kw_only=True)
 class XopRobotConfig(RobotConfig):
-    """What all robots of this project have in common."""
+    """Settings common to all robots of this project."""
 
     session: str = "default"  # pairs this robot with the teleoperator of the same session
-    fps: int = 25  # rate of the control loop [Hz]; divides 50 and equals --dataset.fps
-    clock: str = "lockstep"  # lockstep: time passes in send_action alone; realtime: wall clock
-    task: str = ""  # task with its furniture: dual_point_touch, …; none where it is empty
-    task_heights: str = ""  # heights over the task's own, as support=0.35,table=0.6:0.7 [m]
-    seed: int = 0  # the same seed gives the same episodes, bit for bit, in lockstep
+    fps: int = 25  # control rate [Hz]; must divide 50 and equal --dataset.fps
+    clock: str = "lockstep"  # lockstep: only send_action advances time; realtime: wall clock
+    task: str = ""  # task to set up: dual_point_touch, …; empty for none
+    task_heights: str = ""  # override heights: support=0.35,table=0.6:0.7 [m]
+    seed: int = 0  # in lockstep equal seeds give bit-identical episodes
     cameras: list[str] | str = field(
         default_factory=lambda: ["head"]
     )  # [head, scene] or head,scene
-    width: int = 320  # of a picture [pixels]
-    height: int = 240  # of a picture [pixels]
-    viewer: bool = False  # show the running simulation in a window, or in the browser
+    width: int = 320  # image width [px]
+    height: int = 240  # image height [px]
+    viewer: bool = False  # show the simulation in a window, or in the browser
     sim: SceneConfig = field(default_factory=SceneConfig)  # scene and sensor noise
     low_level: LowLevelConfig = field(default_factory=LowLevelConfig)  # low-level policy
 
@@ -71,12 +71,11 @@ class XopRobotConfig(RobotConfig):
     """Name of the robot's morphology."""
 
     def __post_init__(self) -> None:
-        """Check every value. LeRobot's own check expects camera objects and is left out.
+        """Validate all values, in place of LeRobot's own check, which expects camera objects.
 
         Raises:
-            BadValue: If a number is out of its range, with the range, or there are heights without
-                a task.
-            UnknownName: If there is no such task, clock or noise, with the known ones.
+            BadValue: If a number is out of its range, or heights are given without a task.
+            UnknownName: If there is no such task, clock or noise, listing the known ones.
         """
         fill_nulls(self)
         self.task, self.sim.scene = find_text(self.task), find_text(self.sim.scene)
@@ -105,10 +104,10 @@ class XopRobotConfig(RobotConfig):
 
     @property
     def scene(self) -> str:
-        """Name of the scene that the robot stands in.
+        """Name of the scene.
 
         Raises:
-            UnknownName: If there is no such task, with the known ones.
+            UnknownName: If there is no such task, listing the known ones.
         """
         if self.sim.scene or not self.task:
             return self.sim.scene or "empty"
@@ -119,7 +118,7 @@ class XopRobotConfig(RobotConfig):
 
         Raises:
             BadValue: If a size or the seed is out of its range.
-            UnknownName: If there is no such noise, with the known ones.
+            UnknownName: If there is no such noise, listing the known ones.
         """
         return SimulationConfig(
             scene=self.scene,

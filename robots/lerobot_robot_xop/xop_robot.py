@@ -1,4 +1,4 @@
-"""The robots as LeRobot devices: a low-level policy and a plant behind whole-body commands."""
+"""The robots as LeRobot devices: whole-body commands to a low-level policy and a plant."""
 
 from __future__ import annotations
 
@@ -34,20 +34,19 @@ if TYPE_CHECKING:
 
 
 class XopRobot(Robot):
-    """A robot that takes whole-body commands; the robots differ in their morphology alone.
+    """A robot driven by whole-body commands; subclasses differ only in their morphology.
 
-    In lock-step, time passes in `send_action` alone, by exactly 1/fps. At the beginning of each
-    episode that is recorded, the next `get_observation` puts the robot back to its start, with a
-    seed made of `config.seed` and the episode's index.
+    In lock-step only `send_action` advances time, by exactly 1/fps. At the start of each recorded
+    episode, the next `get_observation` resets the robot, with a seed made of `config.seed` and the
+    episode's index.
 
     Args:
         config: The robot's configuration.
 
     Raises:
-        UnknownName: If there is no such policy for this robot, no such task, height, scene or
-            camera.
+        UnknownName: If there is no such policy for this robot, task, height, scene or camera.
         BadValue: If the task's heights are out of the robot's reach.
-        PolicyFileError: If the policy's file is missing or not what it should be.
+        PolicyFileError: If the policy's file is missing or malformed.
     """
 
     config_class = XopRobotConfig
@@ -81,7 +80,7 @@ class XopRobot(Robot):
             cameras=dict.fromkeys(config.cameras, (config.height, config.width, 3)),
         )
         self.cameras = dict.fromkeys(config.cameras)
-        # The teleoperator must know the robot before either is connected.
+        # The teleoperator needs the robot's description before either is connected.
         self._announce()
         weakref.finalize(self, self._session.withdraw, self._info)
 
@@ -94,7 +93,7 @@ class XopRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, type | tuple[int, int, int]]:
-        """Proprioception as floats, then a picture of each camera (height, width, 3)."""
+        """Proprioception as floats, then an image per camera (height, width, 3)."""
         return {**dict.fromkeys(self._body.state_keys, float), **self._info.cameras}
 
     @property
@@ -104,12 +103,12 @@ class XopRobot(Robot):
 
     @property
     def is_connected(self) -> bool:
-        """Whether the robot stands and takes actions."""
+        """Whether the robot is ready for actions."""
         return self._loop is not None
 
     @property
     def is_calibrated(self) -> bool:
-        """True: there is nothing to calibrate."""
+        """True: no calibration is needed."""
         return True
 
     def calibrate(self) -> None:
@@ -119,7 +118,7 @@ class XopRobot(Robot):
         """Do nothing."""
 
     def connect(self, calibrate: bool = True) -> None:
-        """Put the robot on its feet and let its policy settle it for a second."""
+        """Start the robot standing, and let its policy settle for a second."""
         del calibrate
         if self.is_connected:
             return
@@ -138,7 +137,7 @@ class XopRobot(Robot):
             raise
 
     def _make_plant(self) -> Simulation:
-        """Make the simulated robot, with the task's furniture about it where one is asked for."""
+        """Make the simulated robot, in the task's scene if there is one."""
         from xop_lerobot.plant.simulation import Simulation  # noqa: PLC0415
         from xop_lerobot.tasks.stage import Stage  # noqa: PLC0415
 
@@ -167,7 +166,7 @@ class XopRobot(Robot):
         return self._loop
 
     def get_observation(self) -> dict[str, Any]:
-        """Measure the robot, take the pictures, and begin a tick of the session with both.
+        """Measure the robot, render the cameras, and start a tick of the session with both.
 
         Raises:
             NotConnected: Before `connect()`.
@@ -190,17 +189,16 @@ class XopRobot(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         """Execute `action` for one control period.
 
-        Positions that `action` leaves out stay as they were; a velocity that is not asked for
-        anew stops, so nobody who moves joints alone walks on. Keys of `observation.state` that
-        are no action are passed over: LeRobot sends them when it moves a robot back to where it
-        started.
+        Positions missing from `action` keep their last value; missing velocities are set to zero,
+        so that moving only joints never keeps the robot walking. Keys of `observation.state` that
+        are not actions are ignored: LeRobot sends them when it returns a robot to its start.
 
         Returns:
-            What the robot really executes, limits applied, for every action key.
+            The executed action after limits, for every action key.
 
         Raises:
             NotConnected: Before `connect()`.
-            UnknownName: If a key is neither of an action nor of an observation.
+            UnknownName: If a key is neither an action nor an observation.
             BadValue: If a value is not finite.
         """
         loop = self._connected_loop
@@ -212,7 +210,7 @@ class XopRobot(Robot):
         self._last_action = loop.execute(wanted, 1 / self.config.fps)
         outcome = None if self._stage is None else self._stage.update()
         executed = layout.to_dict(self._last_action)
-        # LeRobot also moves a robot that nobody has observed, back to its start: no tick then.
+        # LeRobot also returns an unobserved robot to its start: there is no tick then.
         if (tick := self._session.tick) is not None:
             self._session.put(dataclasses.replace(tick, executed=executed, outcome=outcome))
         return dict(executed)
@@ -229,10 +227,10 @@ class XopRobot(Robot):
 
 
 def _check_cameras(morphology: Morphology, config: XopRobotConfig) -> None:
-    """Check scene and cameras, before anything is simulated.
+    """Check that scene and cameras exist, before anything is simulated.
 
     Raises:
-        UnknownName: If there is no such scene or camera, with the known ones.
+        UnknownName: If there is no such scene or camera, listing the known ones.
     """
     spec = build_scene_spec(morphology, "full", config.scene)
     if config.task:

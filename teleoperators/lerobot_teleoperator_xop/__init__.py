@@ -1,8 +1,7 @@
 """LeRobot teleoperator `xop`: XR device, alignment and retargeter in one.
 
-LeRobot imports this package because the distribution bears its name; the import registers the
-robots of `lerobot_robot_xop` too. The device classes bring MuJoCo, so they are loaded when they
-are first asked for.
+LeRobot imports this package because the distribution has its name; the import also registers the
+robots of `lerobot_robot_xop`. The device class imports MuJoCo, so it is loaded on first access.
 """
 
 from __future__ import annotations
@@ -21,6 +20,6 @@ __all__ = ["RecordingConfig", "Xop", "XopConfig"]
 def __getattr__(name: str) -> object:
     if name != "Xop":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from lerobot_teleoperator_xop.xop import Xop  # noqa: PLC0415  brings MuJoCo
+    from lerobot_teleoperator_xop.xop import Xop  # noqa: PLC0415  imports MuJoCo
 
     return Xop

@@ -1,4 +1,4 @@
-"""Keys of the terminal, where LeRobot's commands do not read them themselves."""
+"""Terminal keys that change settings, shared with LeRobot's own keys where necessary."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _RECORDING_KEYS = {
 
 
 def listen_to_terminal(target: Target) -> TerminalKeyListener | None:
-    """Let keys of this terminal change `target`; None where they can't be read.
+    """Change `target` by keys of this terminal; None if they cannot be read.
 
-    Without a display LeRobot's record and rollout commands read the terminal themselves, and
-    two readers would take each other's keys. `xop-record` shares its reader instead.
+    Without a display LeRobot's record and rollout commands read the terminal themselves, and two
+    readers would take each other's keys. `xop-record` shares its reader instead.
     """
     taken = not pynput_can_capture() and (runs(RECORD_MODULE) or runs(CONTEXT_MODULE))
     if taken or not sys.stdin.isatty():
@@ -46,10 +46,10 @@ def listen_to_terminal(target: Target) -> TerminalKeyListener | None:
 
 
 def listen_while_recording(target: Target) -> tuple[Any, dict[str, bool]]:
-    """Read LeRobot's keys of a recording and those of the settings with one listener.
+    """Read LeRobot's recording keys and the settings keys with one listener.
 
     Returns:
-        The listener, which has `stop()`, or None; and the events that its keys set.
+        The listener with a method `stop()`, or None; and the events that its keys set.
     """
     events = {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
     help_text = f"Right/Left/Esc, or n=next, r=re-record, q=quit; {HELP}"
@@ -57,7 +57,7 @@ def listen_while_recording(target: Target) -> tuple[Any, dict[str, bool]]:
 
 
 def make_dispatch(target: Target, events: dict[str, bool]) -> Callable[[str], None]:
-    """Make what is called with the name of each key."""
+    """Make the callback for key names."""
 
     def dispatch(key: str) -> None:
         if key.lower() in _RECORDING_KEYS:

@@ -1,4 +1,4 @@
-"""The teleoperator as a LeRobot device."""
+"""The teleoperator as a LeRobot device: XR device, alignment and retargeter of one robot."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 
 
 class Xop(Teleoperator):
-    """XR device, alignment and retargeter of one robot, which it finds through its session.
+    """Drives the robot of its session by an XR device, alignment and retargeter.
 
     While it exists, LeRobot's record and rollout loops write `XopDataset`s of its robot.
 
@@ -46,8 +46,8 @@ class Xop(Teleoperator):
 
     Raises:
         UnknownName: If there is no such device.
-        BadValue: If a setting of the device is out of its range or missing, the operator's
-            calibration cannot be read, or obstacles are given that this robot would ignore.
+        BadValue: If a device setting is missing or out of range, the operator's calibration cannot
+            be read, or obstacles are given that this robot would ignore.
     """
 
     config_class = XopConfig
@@ -65,7 +65,7 @@ class Xop(Teleoperator):
         self._control_path = find_socket(config.control, config.session)
         self._control: ControlServer | None = None
         self._keys: TerminalKeyListener | None = None
-        # Refuses a bad device here, before a robot or a dataset exists.
+        # Raises for an invalid device here, before a robot or a dataset exists.
         device = make_device(config.device)
         self._has_person = not device.self_engaging
         self._check_obstacles()
@@ -79,16 +79,16 @@ class Xop(Teleoperator):
         weakref.finalize(self, self.host.remove)
 
     def _check_obstacles(self) -> None:
-        """Refuse obstacles that would be ignored, if the robot is there already."""
+        """Refuse obstacles that would be ignored, if the robot already exists."""
         if not (self.config.retargeter.obstacles and self.action_features):
             return
-        from xop_lerobot.retarget.factory import check_obstacles  # noqa: PLC0415  brings MuJoCo
+        from xop_lerobot.retarget.factory import check_obstacles  # noqa: PLC0415  imports MuJoCo
 
         check_obstacles(self.config.retargeter, self._session.robot.morphology)
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Action keys of the session's robot; empty while no robot has been made."""
+        """Action keys of the session's robot; empty until a robot is created."""
         try:
             info = self._session.robot
         except LinkError:
@@ -97,7 +97,7 @@ class Xop(Teleoperator):
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """Nothing: the robot's state comes through the session."""
+        """Empty: the robot's state arrives through the session."""
         return {}
 
     @property
@@ -107,15 +107,15 @@ class Xop(Teleoperator):
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether the operator's height and reach are known, where a person drives."""
+        """Whether the operator's height and reach are known, if the device has a person."""
         return self.person is not None or not self._has_person
 
     def calibrate(self) -> None:
-        """Measure the operator's height and reach, and keep them in LeRobot's folder.
+        """Measure the operator's height and reach, and save them in LeRobot's folder.
 
         Raises:
             NotConnected: Before `connect()`.
-            XopError: If a robot is driven already, or the person could not be measured.
+            XopError: If a robot is already driven, or the operator could not be measured.
         """
         if not self._is_connected:
             raise NotConnected(type(self).__name__)
@@ -142,7 +142,7 @@ class Xop(Teleoperator):
         save_calibration(self.person, fpath or self.calibration_fpath)
 
     def _make_alignment(self) -> AlignmentConfig:
-        """The alignment of the flags, with what the calibration knows of the operator."""
+        """The alignment of the flags, completed by the operator's calibration."""
         flags = self.config.alignment
         if self.person is None or not self._has_person:
             return flags
@@ -153,7 +153,7 @@ class Xop(Teleoperator):
         )
 
     def _note_config(self) -> None:
-        """Publish the configuration, which is saved with a dataset."""
+        """Publish the configuration, which is stored with a dataset."""
         alignment = dataclasses.asdict(self._make_alignment())
         config = dataclasses.asdict(self.config) | {"alignment": alignment}
         self._session.configs["teleop"] = {"type": self.name, **config}
@@ -164,10 +164,10 @@ class Xop(Teleoperator):
     def connect(self, calibrate: bool = True) -> None:
         """Open the device; a recording is read and checked here.
 
-        A robot that exists already is taken up at once, otherwise in the first `get_action`.
+        An existing robot is used at once, otherwise the first `get_action` looks for it.
 
         Raises:
-            LinkError: If there are two robots in the session.
+            LinkError: If the session has two robots.
             BadRecording: If a recording is missing or malformed.
         """
         if self._is_connected:
@@ -193,7 +193,7 @@ class Xop(Teleoperator):
         self._is_connected = True
 
     def _open_control(self) -> None:
-        """Listen for changes at the socket and at the terminal, where the flags ask for it."""
+        """Open the control socket and the terminal keys, if the flags ask for them."""
         if self._control_path is not None:
             from xop_lerobot.control.server import ControlServer  # noqa: PLC0415
 
@@ -210,7 +210,7 @@ class Xop(Teleoperator):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What is in force: preset, weights, targets, constraints, mode.
+        """Current settings: preset, weights, targets, constraints, mode.
 
         Raises:
             XopError: If no robot is driven yet.
@@ -218,10 +218,10 @@ class Xop(Teleoperator):
         return self._driving.settings
 
     def change(self, change: Mapping[str, Any], source: str = "call") -> dict[str, Any]:
-        """Ask for other settings, from any thread; see `Teleoperation.change`.
+        """Request other settings, from any thread; see `Teleoperation.change`.
 
         Raises:
-            XopError: If the change is not valid, or no robot is driven yet.
+            XopError: If the change is invalid, or no robot is driven yet.
         """
         return self._driving.change(change, source)
 
@@ -229,7 +229,7 @@ class Xop(Teleoperator):
         """Toggle the mode, a constraint or a preset; see `Teleoperation.toggle`.
 
         Raises:
-            XopError: If there is nothing of this name, or no robot is driven yet.
+            XopError: If there is no such name, or no robot is driven yet.
         """
         return self._driving.toggle(name, source)
 
@@ -255,11 +255,11 @@ class Xop(Teleoperator):
         return teleoperation
 
     def get_action(self) -> dict[str, float]:
-        """Turn the robot's newest state and the operator's newest frame into an action.
+        """Compute an action from the robot's latest state and the operator's latest frame.
 
         Raises:
             NotConnected: Before `connect()`.
-            LinkError: If the session has no robot, or two, or its robot was never observed.
+            LinkError: If the session has no robot or two, or its robot was never observed.
         """
         if not self._is_connected:
             raise NotConnected(type(self).__name__)
@@ -282,10 +282,10 @@ class Xop(Teleoperator):
         return info.morphology.layout.to_dict(action)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Do nothing: the robot's state comes through the session."""
+        """Do nothing: the robot's state arrives through the session."""
 
     def disconnect(self) -> None:
-        """Close the device and leave LeRobot as it was; may be called twice."""
+        """Close the device and remove the patches of LeRobot; may be called twice."""
         if self._control is not None:
             self._control.close()
             self._control = None
