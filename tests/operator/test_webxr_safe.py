@@ -38,7 +38,7 @@ from xop_lerobot.operator.webxr.certificate import (
     get_certificate,
     list_own_names,
 )
-from xop_lerobot.operator.webxr.pairing import ALPHABET, Door, RateLimit, make_code
+from xop_lerobot.operator.webxr.pairing import ALPHABET, CodeCheck, RateLimit, make_code
 
 NOW = datetime.datetime(2026, 5, 1, tzinfo=datetime.UTC)
 NAMES = frozenset({"desk", "desk.local", "localhost", "127.0.0.1", "::1", "192.168.1.5"})
@@ -67,7 +67,7 @@ def test_codes():
     code = make_code()
     assert len(code) == 8 and set(code) <= set(ALPHABET)
     assert code == make_code()  # the same for the whole process
-    door = Door("RIGHT234")
+    door = CodeCheck("RIGHT234")
     for i in range(5):
         assert str(door.refuse("a", "WRONG", float(i))).startswith("wrong code;")
     assert door.refuse("a", "RIGHT234", 5.0) == (

@@ -1,4 +1,4 @@
-"""From the operator's world to the robot's: engage, scale, and follow."""
+"""Alignment: maps the operator's motion into the robot's world, from engagement on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from xop_lerobot.core.yaml_words import fill_nulls
 from xop_lerobot.operator.frame import OperatorFrame
 
 MIN_OPERATOR_HEIGHT = 0.5
-"""Head height of a person under which the device's origin is surely not the floor [m]."""
+"""Head height below which the device's origin cannot be the floor [m]."""
 SCALES = ("height_scale", "reach_scale", "walk_scale")
 LENGTHS = ("eye_height", "arm_reach")
 
@@ -46,16 +46,16 @@ class AlignmentConfig:
     """Scales from the operator's motion to the robot's.
 
     Attributes:
-        height_scale: Robot's over operator's change of head height; None is the ratio of the
-            two head heights.
-        reach_scale: Robot's over operator's distance from head to wrist; None is the ratio of
-            their reaches where the operator's is known, else the same as the height scale.
-        eye_height: The operator's head height, upright [m]; None measures it at engage. A
-            calibration knows it.
+        height_scale: Ratio of robot to operator change of head height; None for the ratio of their
+            head heights.
+        reach_scale: Ratio of robot to operator distance from head to wrist; None for the ratio of
+            their reaches if the operator's is known, else for the height scale.
+        eye_height: The operator's head height, upright [m]; None to measure it at engage. Set by
+            calibration.
         arm_reach: Horizontal distance from the operator's head to the wrists, arms stretched
-            forward [m]; None: not known. A calibration knows it.
-        walk_scale: Robot's over operator's horizontal travel.
-        frames: Which frames get a goal; the head is followed for alignment in any case.
+            forward [m]; None if unknown. Set by calibration.
+        walk_scale: Ratio of robot to operator horizontal travel.
+        frames: Frames with a goal; the head is used for alignment in any case.
     """
 
     height_scale: float | None = None
@@ -66,12 +66,11 @@ class AlignmentConfig:
     frames: tuple[str, ...] = FRAMES
 
     def __post_init__(self) -> None:
-        """Check every value.
+        """Validate all values.
 
         Raises:
-            BadValue: If a scale or a length is not a finite number above 0, or there is no
-                frame.
-            UnknownName: If a frame is unknown, with the known ones.
+            BadValue: If a scale or length is not a finite number above 0, or there is no frame.
+            UnknownName: If a frame is unknown, listing the known ones.
         """
         fill_nulls(self)
         for name in (*SCALES, *LENGTHS):
@@ -113,7 +112,7 @@ class _Anchor:
 class Alignment:
     r"""Aligns the operator's head and heading with the robot's at engage, and follows from there.
 
-    With A the turn about the vertical that aligns the headings, ₀ the values at engage, ``o``
+    With A the rotation about the vertical that aligns the headings, ₀ the values at engage, ``o``
     the operator and ``r`` the robot:
 
     - head: :math:`p_{xy} = r_{0,xy} + s_{walk} A (o - o_0)_{xy}`,
@@ -122,11 +121,11 @@ class Alignment:
     - wrists: :math:`p = p_{head} + s_{reach} A (o_{wrist} - o_{head})`, :math:`R = A R_o`: hands
       keep their place from the head, and their frames are the same in person and robot.
 
-    Turning, or moving, the operator's world changes no goal. A wrist that is not tracked stays
-    where it was, seen from the head along its heading.
+    Rotating or moving the operator's world changes no goal. An untracked wrist keeps its place
+    relative to the head, along its heading.
 
     Args:
-        config: Scales, and the frames that get a goal.
+        config: Scales, and the frames with a goal.
     """
 
     def __init__(self, config: AlignmentConfig | None = None) -> None:
@@ -161,14 +160,15 @@ class Alignment:
         """Align the operator's head and heading with the robot's, as measured now.
 
         Args:
-            frame: The operator now.
-            robot_frames: Pose of the head and of every frame of the config, robot world (7,).
-            robot_head_height: Height of the robot's head over the ground [m].
+            frame: The operator's frame.
+            robot_frames: Poses of the head and of every frame of the config, robot world. Shapes
+                (7,).
+            robot_head_height: Height of the robot's head above the ground [m].
             robot_reach: Horizontal distance from the robot's head to its wrists, arms stretched
-                forward [m]; None where it is not known.
+                forward [m]; None if unknown.
 
         Raises:
-            EngageRefused: If the head is not tracked, or is too low to be over the floor.
+            EngageRefused: If the head is not tracked, or is too close to the floor.
             UnknownName: If `robot_frames` lacks a frame.
         """
         if is_lost(frame):
@@ -183,7 +183,7 @@ class Alignment:
             height_scale=height_scale,
             reach_scale=self._find_reach_scale(robot_reach) or height_scale,
         )
-        # A wrist that is not seen yet is wanted where the robot has it.
+        # The goal of a wrist not seen yet is the robot's present one.
         body = pose_inverse(level_pose(robot["head"]))
         self._from_head = {
             name: pose_multiply(body, robot[name]) for name in self.config.frames if name != "head"
@@ -202,7 +202,7 @@ class Alignment:
         While the head is not tracked the last goals are returned; see `is_lost`.
 
         Args:
-            frame: The operator now.
+            frame: The operator's frame.
 
         Returns:
             Pose of each frame of the config, x y z qw qx qy qz. Shapes (7,).
@@ -249,7 +249,7 @@ class Alignment:
         return robot_head_height / (self.config.eye_height or height)
 
     def _find_reach_scale(self, robot_reach: float | None) -> float | None:
-        """The reach scale, None where it is that of heights."""
+        """Reach scale; None to use the height scale."""
         if self.config.reach_scale is not None or self.config.arm_reach is None:
             return self.config.reach_scale
         return None if robot_reach is None else robot_reach / self.config.arm_reach

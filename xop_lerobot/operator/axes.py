@@ -1,10 +1,10 @@
-"""Axes of the headsets' world, the same for ARKit and WebXR."""
+"""Axes of headset coordinates, the same for ARKit and WebXR."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Theirs is x right, y up, z back; the operator's world is X forward, Y left, Z up.
+# Headset: x right, y up, z back. Operator's world: X forward, Y left, Z up.
 WORLD = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
-"""Turns a headset's coordinates into ours. Shape (3, 3)."""
+"""Rotation from headset coordinates to the operator's world. Shape (3, 3)."""
 WORLD.setflags(write=False)

@@ -1,4 +1,4 @@
-"""Calibration: five seconds that measure a person's eye height and arm reach."""
+"""Calibration: measures a person's eye height and arm reach within five seconds."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from xop_lerobot.operator.display import Cue, Display, NoticeBoard
 from xop_lerobot.operator.frame import OperatorFrame
 
 STILL = 0.04
-"""Who is measured stays within this distance meanwhile [m]."""
+"""Largest motion of the measured quantities that counts as still [m]."""
 STAND_S, STRETCH_S = 2.0, 1.5
-"""For how long one stands, and holds the arms stretched [s]."""
+"""Time to stand upright, and to hold the arms stretched [s]."""
 EYE_HEIGHT = (MIN_OPERATOR_HEIGHT, 2.3)
-"""Eyes of people, standing or sitting, are that high over the floor [m]."""
+"""Plausible eye heights above the floor, standing or sitting [m]."""
 ARM_REACH = (0.3, 1.0)
-"""From the eyes to the wrists of arms that are stretched forward [m]."""
+"""Plausible horizontal distances from eyes to wrists, arms stretched forward [m]."""
 UNEVEN = 0.1
-"""Arms that are stretched forward reach equally far, up to this [m]."""
+"""Largest difference between the reaches of both arms [m]."""
 SHOULDERS = (0.0, 0.5)
-"""Wrists of arms that are stretched forward are that far below the eyes [m]."""
+"""Plausible depths of the wrists below the eyes, arms stretched forward [m]."""
 MAX_GAP = 0.3
-"""Longest time without a frame [s]."""
+"""Longest time between frames that continues a measurement [s]."""
 RATE_HZ = 50.0
 HINT_S = 2.0
-"""What is wrong for so long is said [s]."""
+"""Time for which a problem must persist before it is shown [s]."""
 
 
 class CalibrationFailed(XopError):
@@ -54,10 +54,10 @@ class Calibration:
     arm_reach: float
 
     def __post_init__(self) -> None:
-        """Check both.
+        """Validate both values.
 
         Raises:
-            BadValue: If one is that of nobody.
+            BadValue: If one is implausible for a person.
         """
         for name, (low, high) in (("eye_height", EYE_HEIGHT), ("arm_reach", ARM_REACH)):
             value = getattr(self, name)
@@ -74,10 +74,10 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
 
 
 def load_calibration(path: Path) -> Calibration:
-    """Read what `save_calibration` has written.
+    """Read a file of `save_calibration`.
 
     Raises:
-        BadValue: If the file holds something else; names it and says what to do.
+        BadValue: If the file is malformed; names it and says what to do.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -92,7 +92,7 @@ def load_calibration(path: Path) -> Calibration:
 
 
 class Step(Enum):
-    """Step of the calibration."""
+    """Step of the calibration; the value is its instruction."""
 
     WAIT = "Waiting for the headset."
     STAND = "Stand upright and look straight ahead."
@@ -101,12 +101,12 @@ class Step(Enum):
 
 
 class Guide:
-    """State machine of the calibration, driven by frames and their stamps.
+    """State machine of the calibration, driven by time-stamped frames.
 
     Attributes:
-        step: What the person does now.
-        progress: How much of it has been seen, from 0 to 1.
-        result: What was measured, None before the end.
+        step: Current step.
+        progress: Completed share of the step, from 0 to 1.
+        result: Measured values, None before the end.
     """
 
     def __init__(self) -> None:
@@ -115,10 +115,10 @@ class Guide:
         self._seen: deque[tuple[float, np.ndarray]] = deque()
         self._eye_height = 0.0
         self.hint = ""
-        """Why it does not go on; empty if it does."""
+        """Why the measurement does not advance; empty if it does."""
 
     def update(self, frame: OperatorFrame | None) -> None:
-        """Take a frame, None before the first."""
+        """Process a frame, None before the first."""
         if self.step is Step.DONE or frame is None or not frame.tracked[0]:
             self._begin(self.step)
             self.hint = "" if self.step is Step.DONE else "The headset is not seen."
@@ -167,7 +167,7 @@ class Guide:
             self._begin(Step.DONE)
 
     def _watch(self, time: float, value: np.ndarray, length: float) -> np.ndarray | None:
-        """Median of `value` over `length` [s] in which it has not moved; None before that."""
+        """Median of `value` over the last `length` [s] without motion; None before that."""
         self._seen.append((time, np.array(value)))
         values = np.array([each for _, each in self._seen])
         while len(values) > 1 and np.ptp(values, axis=0).max() > STILL:
@@ -178,7 +178,7 @@ class Guide:
 
 
 def _find_fault(frame: OperatorFrame, arms: np.ndarray) -> str:
-    """Reason why `arms` are not stretched forward, (2, 3) from the head; empty if they are."""
+    """Why `arms` (2, 3), relative to the head, are not stretched forward; empty if they are."""
     if not frame.tracked.all():
         return "A hand is not seen."
     middle = arms.mean(axis=0)
@@ -205,17 +205,17 @@ def calibrate(
 ) -> Calibration:
     """Guide the person in the headset through the calibration.
 
-    What to do is said, and shown in the headset.
+    Instructions are passed to `say`, and shown in the headset.
 
     Args:
         device: Connected headset.
         say: Called with each instruction.
         clock: Time [s].
-        sleep: Waits so long [s].
-        patience_s: After so long without a result it is given up [s].
+        sleep: Waits for the given time [s].
+        patience_s: Time without a result after which calibration fails [s].
 
     Raises:
-        CalibrationFailed: If it is; says what was missing.
+        CalibrationFailed: If it fails; says what was missing.
     """
     guide, board = Guide(), NoticeBoard()
 
@@ -235,7 +235,7 @@ def calibrate(
             step, hint, hinted = guide.step, "", now
             tell(Cue.SETTING, step.value)
         elif problem != hint and now - hinted >= HINT_S:
-            # Who is still about to do it needs no hint yet.
+            # No hint while the person is still starting to follow the instruction.
             hint, hinted = problem, now
             if problem:
                 tell(Cue.REFUSED, problem)

@@ -1,7 +1,7 @@
-"""The operator's columns of a recorded LeRobot dataset, read as an operator recording.
+"""Operator columns of a recorded LeRobot dataset, read as an operator recording.
 
-Recordings of hardware are not as even as those of a simulation: tracking drops out, the person
-lets go of the robot and takes it up again, and clocks jitter. All of that plays as it was.
+Recordings of hardware are less regular than simulated ones: tracking drops out, the person
+disengages and engages again, and clocks jitter. All of that is replayed.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ logger = logging.getLogger(__name__)
 
 POSE_COLUMNS = tuple(f"operator.{frame}" for frame in FRAMES)
 COLUMNS = {**dict.fromkeys(POSE_COLUMNS, 7), "operator.pinch": 2, "operator.tracked": 3}
-"""Columns that are needed, and the numbers that they hold in a row."""
+"""Required columns, and the size of their rows."""
 ENGAGED_COLUMN = "operator.engaged"
 CLOCKS = {"time.sim": 1.0, "time.wall": 1e-9, "timestamp": 1.0}
-"""Columns that tell the time, best first, and the seconds that one of their units is. Of a robot
-without a clock of its own the first stands still."""
+"""Time columns in order of preference, with seconds per unit. For a robot without a clock of its
+own the first stands still."""
 OPTIONAL_COLUMNS = (ENGAGED_COLUMN, "action", *CLOCKS)
 _MOST = 0.9
-"""Share of the rows in which a clock must go on, and by itself, to be used."""
+"""Share of the rows at which a clock must advance, not counting adjustments, to be used."""
 _MOVED_M = 0.15
-"""Nobody's head or wrist moves farther from one row to the next [m]."""
+"""Largest plausible motion of head or wrist between two rows [m]."""
 _FAR_OFF = 100.0
-"""A clock that is faster or slower than the dataset's rate by this factor counts in other units."""
+"""Factor from the dataset's rate beyond which a clock must be in other units."""
 
 
 def is_dataset(path: str | Path) -> bool:
@@ -53,15 +53,15 @@ def is_dataset(path: str | Path) -> bool:
 def load_dataset_recording(root: str | Path, episode: int = 0) -> Recording:
     """Read the operator's motion in one episode, from the first engagement.
 
-    The mode is what the robot was told (`mode.pos` of the action), so that the same motion
-    drives another robot in the same modes.
+    The mode is that of the recorded action (`mode.pos`), so that the same motion drives another
+    robot in the same modes.
 
     Args:
         root: Directory of the dataset.
         episode: Index of the episode.
 
     Raises:
-        BadRecording: If the dataset has no operator columns, no such episode, or bad data.
+        BadRecording: If the dataset lacks operator columns or the episode, or has bad data.
     """
     root = Path(root)
     info = _read_info(root)
@@ -74,14 +74,14 @@ def load_dataset_recording(root: str | Path, episode: int = 0) -> Recording:
 
 
 def choose_columns(root: object, features: Mapping[str, Any]) -> list[str]:
-    """Names of the columns of a recording.
+    """Return the columns to read for a recording.
 
     Args:
-        root: The dataset, for the message.
+        root: The dataset, for messages.
         features: Its features.
 
     Raises:
-        BadRecording: If it lacks one that is needed, or holds something else in it.
+        BadRecording: If a required column is missing or malformed.
     """
     missing = [column for column in COLUMNS if column not in features]
     if missing:
@@ -113,22 +113,22 @@ def make_dataset_recording(
     source: object,
     fps: float | None = None,
 ) -> tuple[Recording, np.ndarray]:
-    """Make a recording of an episode's columns.
+    """Make a recording from the columns of an episode.
 
-    It reaches from the first row in which the operator drove to the last. Rows in which the clock
-    stands still are left out, and so are the jumps that it makes when somebody sets it.
+    It spans the first to the last engaged row. Rows at which the clock stands still are left out,
+    and its adjustments are removed.
 
     Args:
         columns: The columns of `choose_columns`. Shapes (n, size).
         features: The dataset's features.
-        source: What they came from, for the messages.
-        fps: The dataset's rows a second [Hz], if known; a clock that is far off is not believed.
+        source: Their origin, for messages.
+        fps: The dataset's frame rate [Hz], if known; a clock far from it is not used.
 
     Returns:
         The recording, and the row of each of its samples. Shape (T,).
 
     Raises:
-        BadRecording: If nobody drove, no clock runs, or the data are bad.
+        BadRecording: If nobody engaged, no clock runs, or the data are bad.
     """
     engaged = np.ones(len(columns["operator.tracked"]), bool)
     if ENGAGED_COLUMN in columns:
@@ -155,7 +155,7 @@ def make_dataset_recording(
     }
     for limb, frame in enumerate(FRAMES):
         poses = np.asarray(columns[f"operator.{frame}"][rows], float)
-        # Columns hold zeros where the device gave nothing; the flag says so.
+        # Unknown poses are stored as zeros, with the flag False: make them valid poses.
         unknown = ~tracked[:, limb] & ~_is_pose(poses)
         arrays[f"{frame}_pose"] = np.where(unknown[:, None], IDENTITY_POSE, poses)
     names = (features.get("action") or {}).get("names")
@@ -175,7 +175,7 @@ def _is_pose(poses: np.ndarray) -> np.ndarray:
 
 
 def _find_leaps(columns: Mapping[str, np.ndarray], span: np.ndarray) -> np.ndarray:
-    """Find the rows in which a limb has jumped since the row before. Shape (n,), bool."""
+    """Find the rows in which a limb has jumped since the previous row. Shape (n,), bool."""
     leaps = np.zeros(len(span), bool)
     tracked = columns["operator.tracked"][span] > 0
     for limb, frame in enumerate(FRAMES):
@@ -189,13 +189,13 @@ def _find_leaps(columns: Mapping[str, np.ndarray], span: np.ndarray) -> np.ndarr
 def _choose_clock(
     clocks: Mapping[str, np.ndarray], moved: np.ndarray, source: object, fps: float | None
 ) -> RowClock | None:
-    """Choose the best running clock with about the rate of the rows; None if there is none.
+    """Choose the most preferred clock that runs at about the rate of the rows; None if none does.
 
     Args:
         clocks: Columns of `CLOCKS`. Shapes (n,).
-        moved: Whether the person is elsewhere than in the row before. Shape (n,), bool.
-        source: What they came from, for the log.
-        fps: Rows a second [Hz], if known.
+        moved: Whether the person has moved too far since the previous row. Shape (n,), bool.
+        source: Their origin, for the log.
+        fps: Frame rate [Hz], if known.
     """
     for name, ticks in clocks.items():
         clock = read_row_clock(ticks, CLOCKS[name], moved)
@@ -230,7 +230,7 @@ def _read_episode(
     import pyarrow as pa  # noqa: PLC0415
     import pyarrow.parquet as pq  # noqa: PLC0415
 
-    # LeRobot numbers an episode's files along with it, so the sorted order is the order in time.
+    # LeRobot numbers data files consecutively, so sorting gives their order in time.
     files = sorted((root / "data").glob("**/*.parquet"))
     only = [("episode_index", "==", episode)]
     try:

@@ -1,4 +1,4 @@
-"""The interface of an XR device and the registry of devices."""
+"""Interface of an XR device."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from xop_lerobot.operator.frame import OperatorFrame
 
 
 class Device(ABC):
-    """A source of operator frames; nothing behind it depends on the device.
+    """A source of operator frames; all later stages are independent of the device.
 
     Attributes:
-        self_engaging: Whether the device engages by itself once the robot has settled
-            (recordings and scripts do; people use a gesture).
-        start_mode: The mode in which the operator starts, as long as no frame states one.
+        self_engaging: Whether the device engages by itself once the robot has settled (as
+            recordings and scripts do; people use a gesture).
+        start_mode: Initial mode, until a frame states one.
     """
 
     self_engaging: bool = False
@@ -45,12 +45,12 @@ class Device(ABC):
         """Return the newest frame at `time` [s] of the robot's clock, None before the first."""
 
     def is_finished(self, time: float) -> bool:
-        """Whether a recording or script has played out at `time`; people never finish."""
+        """Whether a recording or script has ended at `time` [s]; people never finish."""
         del time
         return False
 
     def is_paused(self, time: float) -> bool:
-        """Whether the tracked person has paused driving; the robot holds."""
+        """Whether the recorded person is disengaged at `time` [s]; the robot holds."""
         del time
         return False
 
@@ -67,5 +67,5 @@ class Device(ABC):
         del display
 
     def take_requests(self) -> tuple[RecordingRequest, ...]:
-        """Requests to the recorder, by buttons, since the last call."""
+        """Return requests to the recorder made by buttons since the last call."""
         return ()

@@ -1,4 +1,4 @@
-"""Display of a headset, notices, and the operator's requests to the recorder."""
+"""Content of a headset's display, notices, and the operator's requests to the recorder."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from xop_lerobot.core.paced_log import PacedLog
 logger = logging.getLogger(__name__)
 
 MAX_ALIKE = 2
-"""Notices of one cue that are kept."""
+"""Largest number of kept notices of one cue."""
 
 
 class Cue(Enum):
-    """Kind of a notice; a headset has a sound for each."""
+    """Kind of a notice; headsets play a sound for each."""
 
     ENGAGED = "engaged"
     DISENGAGED = "disengaged"
@@ -37,13 +37,13 @@ class RecordingRequest(Enum):
     """Request of the operator concerning the episode being recorded."""
 
     END = "end"
-    """Save it, and go on with the next."""
+    """Save it, and continue with the next."""
     REDO = "redo"
     """Discard it and record it again."""
     STOP = "stop"
     """Save it and end the session."""
     SUCCESS = "success"
-    """Mark it as a success, or take the mark off again."""
+    """Mark it as a success, or remove the mark."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Notice:
     """One notice to the operator.
 
     Attributes:
-        number: Counts up, so that each is shown and sounded once.
-        cue: What has happened.
-        text: The same in words.
+        number: Running number, so that each notice is shown and sounded once.
+        cue: Kind of the event.
+        text: Description of the event.
     """
 
     number: int
@@ -64,8 +64,8 @@ class Notice:
 class NoticeBoard:
     """The last notices, numbered consecutively.
 
-    Of one cue there are at most two, so that what happens all the time, as settings that a
-    program changes, drives nothing else from the board; the log is paced for the same reason.
+    At most `MAX_ALIKE` notices of one cue are kept, so that frequent events, such as settings
+    changed by a program, do not displace all others; the log is rate-limited for the same reason.
     """
 
     def __init__(self, length: int = 5) -> None:
@@ -88,7 +88,7 @@ class NoticeBoard:
 
     @property
     def notices(self) -> tuple[Notice, ...]:
-        """The last ones, the newest at the end."""
+        """The latest notices, newest last."""
         return tuple(self._notices)
 
 
@@ -98,8 +98,8 @@ class Progress:
 
     Attributes:
         episode: Index of the episode that is recorded.
-        frames: Its frames so far.
-        seconds: Its length so far [s].
+        frames: Number of its frames so far.
+        seconds: Its duration so far [s].
         success: Whether it counts as a success so far.
         paused: Whether this is the pause after the episode, which is not saved yet.
     """
@@ -117,15 +117,15 @@ class Display:
 
     Attributes:
         time: Clock of the robot [s].
-        engaged: Whether the operator drives.
+        engaged: Whether the operator is engaged.
         mode: Mode of the robot.
-        clutch: How much of the hold of the gesture that is held has passed, from 0 to 1.
-        holding: What that gesture will do, in words; empty where none is held.
-        notices: What has happened lately, the newest at the end.
-        warnings: What is wrong now, in words.
+        clutch: Completed share of the current gesture's hold, from 0 to 1.
+        holding: Effect of the current gesture, as text; empty without one.
+        notices: Latest notices, newest last.
+        warnings: Present warnings, as text.
         fallen: Whether the robot has fallen.
-        progress: How far the recording is, None where nothing is recorded.
-        pictures: What the robot's cameras see, by name. Shapes (height, width, 3), uint8.
+        progress: Progress of the recording, None without one.
+        pictures: Camera images by name. Shapes (height, width, 3), uint8.
     """
 
     time: float
@@ -145,8 +145,8 @@ class SeenObject:
     """An object in the robot's world.
 
     Attributes:
-        pose: Pose of its middle, robot's world, x y z qw qx qy qz. Shape (7,).
-        size: Half its extents along its own axes; zero for a point [m]. Shape (3,).
+        pose: Pose of its centre in the robot's world, x y z qw qx qy qz. Shape (7,).
+        size: Half extents along its own axes; zero for a point [m]. Shape (3,).
     """
 
     pose: np.ndarray
@@ -155,19 +155,19 @@ class SeenObject:
 
 @dataclass(frozen=True)
 class View:
-    """The truth that a headset could show at one instant; a simulated person blurs it.
+    """True content that a headset could show; the simulated person adds perception errors.
 
     Attributes:
         time: Clock of the robot [s].
-        task: Name of the task that runs; empty where none does.
+        task: Name of the running task; empty without one.
         frames: Pose of the robot's `head`, `left_wrist`, `right_wrist`, `left_palm` and
             `right_palm`, robot's world. Shapes (7,).
-        objects: What the task put into the scene, by name.
-        mode: Mode that the robot is in, as the headset's display shows it.
-        engaged: Whether the operator drives, as the display shows it.
+        objects: Objects of the task, by name.
+        mode: Mode of the robot, as displayed.
+        engaged: Whether the operator is engaged, as displayed.
         fallen: Whether the robot has fallen.
         success: Whether the task is accomplished.
-        hints: What a person who has practised the task knows, by name (docs/use/tasks.md) [m].
+        hints: Knowledge of a practised person, by name (docs/use/tasks.md) [m].
     """
 
     time: float

@@ -20,10 +20,10 @@ from xop_lerobot.operator.display import Cue, NoticeBoard
 from xop_lerobot.operator.frame import OperatorFrame
 
 GESTURES = ("palms_up", "both_pinch")
-"""`palms_up`: both hands pinch with their palms up. `both_pinch`: both pinch, however they lie."""
+"""`palms_up`: both hands pinch with palms up. `both_pinch`: both pinch in any orientation."""
 WRISTS = ("left_wrist", "right_wrist")
 PALM_UP = -0.5
-"""The back of a hand that shows its palm points at least 30 degrees below the horizon."""
+"""Largest vertical component of the back-of-hand axis of a palm-up hand: 30° below the horizon."""
 
 
 @dataclass
@@ -31,13 +31,13 @@ class ClutchConfig:
     """Settings of the gesture that engages and disengages.
 
     Attributes:
-        gesture: What is held, one of `GESTURES`. Grippers close with pinches, so with
-            ``"both_pinch"`` who carries something with both hands lets go of the robot.
-        hold: For how long [s].
-        on: A hand closes at this distance of thumb and index tip [m].
-        off: It opens again at this distance [m].
-        max_speed: Hands that are faster hold nothing [m/s].
-        max_gap: Longest time between two frames over which the gesture goes on [s].
+        gesture: The gesture, one of `GESTURES`. Pinches also close grippers, so with
+            ``"both_pinch"`` carrying something with both hands disengages the robot.
+        hold: Time it is held [s].
+        on: Distance of thumb and index tip at which a hand closes [m].
+        off: Distance at which it opens again [m].
+        max_speed: Hand speed above which the hold is interrupted [m/s].
+        max_gap: Longest time between two frames that continues the gesture [s].
     """
 
     gesture: str = "palms_up"
@@ -48,10 +48,10 @@ class ClutchConfig:
     max_gap: float = 0.2
 
     def __post_init__(self) -> None:
-        """Check every value.
+        """Validate all values.
 
         Raises:
-            UnknownName: If there is no such gesture, with the known ones.
+            UnknownName: If there is no such gesture, listing the known ones.
             BadValue: If a number is not above 0, or `on` is not below `off`.
         """
         fill_nulls(self)
@@ -74,16 +74,15 @@ class ClutchRequest(Enum):
 
 
 class Clutch:
-    """Detects from the frames when to engage and disengage.
+    """Detects the gesture that engages and disengages.
 
-    The gesture counts when it was held for `hold` seconds, with both hands seen and still. It
-    then asks until it is granted, which `update` is told by `engaged`, and no more until the
-    hands have opened: one long hold does one thing. A lost head, or a stream that does not go
-    on, lets go at once. Only stamps count, so that a recorded stream replays to the same
-    engagements.
+    The gesture counts after `hold` seconds with both hands tracked and still. The request then
+    persists until it is granted, which `engaged` reports, and is not repeated until the hands have
+    opened: one long hold has one effect. A lost head, or a stream that stalls, disengages at once.
+    Only stamps count, so a recorded stream replays with the same engagements.
 
     Args:
-        config: The gesture and its durations.
+        config: Gesture and durations.
     """
 
     def __init__(self, config: ClutchConfig | None = None) -> None:
@@ -91,23 +90,23 @@ class Clutch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything seen so far."""
+        """Forget all samples."""
         self._time: float | None = None
         self._wrists: np.ndarray | None = None
         self._since: float | None = None
-        self._spent = True  # hands that are closed from the beginning must open first
+        self._spent = True  # hands that start closed must open first
         self._engaged: bool | None = None
         self.progress = 0.0
-        """How much of `hold` has passed, from 0 to 1."""
+        """Elapsed share of `hold`, from 0 to 1."""
 
     def update(self, frame: OperatorFrame | None, engaged: bool) -> ClutchRequest:
-        """Take one sample.
+        """Process one sample.
 
-        Frames with the stamp of the last one change nothing; a stamp that goes back starts anew.
+        Frames with the previous stamp change nothing; an earlier stamp resets the detector.
 
         Args:
-            frame: The operator now, None before the first.
-            engaged: Whether the operator drives the robot now.
+            frame: The operator's frame, None before the first.
+            engaged: Whether the operator is engaged.
         """
         if engaged is not self._engaged:
             self._spent, self._engaged = True, engaged
@@ -133,7 +132,7 @@ class Clutch:
         self._time, self._wrists = frame.time, wrists
         if not self._is_shown(frame) or not still:
             self._since, self.progress = None, 0.0
-            # Hands that are lost have not been seen to open.
+            # Only tracked hands can be seen to open.
             self._spent &= not (
                 frame.tracked.all() and bool((frame.pinch >= self.config.off).any())
             )
@@ -143,7 +142,7 @@ class Clutch:
         self.progress = 0.0 if self._spent else self._compute_progress(frame.time - self._since)
 
     def _compute_progress(self, held: float) -> float:
-        # Stamps add up rounding; a microsecond must not cost a sample.
+        # Sums of stamps round; a microsecond of tolerance saves waiting for another sample.
         return min((held + 1e-6) / self.config.hold, 1.0)
 
     def _is_still(self, time: float, wrists: np.ndarray) -> bool:
@@ -154,7 +153,7 @@ class Clutch:
         return dt <= self.config.max_gap and bool(speed <= self.config.max_speed)
 
     def _is_shown(self, frame: OperatorFrame) -> bool:
-        """Whether both hands make the gesture; once begun, until they open."""
+        """Whether both hands make the gesture; once started, until they open."""
         near = self.config.on if self._since is None else self.config.off
         if not frame.tracked.all() or not bool((frame.pinch < near).all()):
             return False
@@ -167,24 +166,23 @@ class Clutch:
 logger = logging.getLogger(__name__)
 
 UNSEEN = "the headset has lost its position, or sends nothing"
-"""Why the operator has let go, where the device knows no better."""
+"""Fallback reason for a disengagement if the device reports none."""
 
 
 class Engagement:
     """Engages and disengages the operator.
 
-    A device that engages by itself does so as soon as the robot has settled. Who wears a headset
-    engages, and lets go, by the gesture of the clutch. Loss of the head's tracking, a fall and
-    whatever else the robot does that it was not told to end an engagement, the next one aligns
-    anew, and nobody engages meanwhile.
+    A self-engaging device engages as soon as the robot has settled. A person in a headset engages
+    and disengages by the clutch gesture. Loss of head tracking, a fall, and any other trouble of
+    the robot end an engagement; the next one aligns again, and none starts while the trouble lasts.
 
     Args:
-        device: Where the operator's motion comes from.
-        alignment: Lays the operator on the robot.
-        clutch: Reads the gesture; None for devices that engage by themselves.
-        board: Where the operator is told what happens.
-        robot_reach: Forward reach of the robot's arms [m], None where it does not matter.
-        begin: Called with the state and the robot's frames when an engagement begins.
+        device: Source of the operator's motion.
+        alignment: Mapping from the operator to the robot.
+        clutch: Detects the gesture; None for self-engaging devices.
+        board: Notices to the operator.
+        robot_reach: Forward reach of the robot's arms [m], None if not needed.
+        begin: Called with the state and the robot's frames when an engagement starts.
         end: Called when one ends.
     """
 
@@ -216,7 +214,7 @@ class Engagement:
 
     @property
     def is_engaged(self) -> bool:
-        """Whether the operator drives."""
+        """Whether the operator is engaged."""
         return self.alignment.is_engaged
 
     @property
@@ -231,14 +229,14 @@ class Engagement:
 
         Args:
             state: The robot now.
-            frame: The operator now, None before the first frame.
+            frame: The operator's frame, None before the first.
             poses: The robot's frames by name. Shapes (7,).
 
         Returns:
-            The frame to use: another one where the device's clock starts with this tick.
+            The frame to use, which is a new one if the device's clock starts with this tick.
 
         Raises:
-            EngageRefused: If a device that engages by itself cannot, the first time.
+            EngageRefused: If a self-engaging device cannot engage the first time.
         """
         if self.clutch is not None:
             self._follow_clutch(self.clutch, state, frame, poses)
@@ -290,7 +288,7 @@ class Engagement:
             if state.fallen:
                 self._let_go("the robot has fallen")
             elif state.trouble:
-                self.disengage()  # what is wrong is told whether anybody drives or not
+                self.disengage()  # the trouble itself is reported elsewhere, engaged or not
             elif request is ClutchRequest.LET_GO and (frame is None or is_lost(frame)):
                 self._let_go(self.device.trouble or UNSEEN)
             elif request is ClutchRequest.LET_GO:
@@ -329,10 +327,10 @@ class Engagement:
     def engage(
         self, state: RobotState, frame: OperatorFrame, poses: Mapping[str, np.ndarray]
     ) -> None:
-        """Lay the operator on the robot and begin to drive it.
+        """Align the operator with the robot and start driving it.
 
         Raises:
-            EngageRefused: If the head is not tracked, or is too low to be over the floor.
+            EngageRefused: If the head is not tracked, or is too close to the floor.
         """
         self.alignment.engage(frame, poses, float(poses["head"][2]), self._robot_reach)
         self._was_engaged, self._was_refused = True, False

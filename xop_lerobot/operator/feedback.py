@@ -1,4 +1,4 @@
-"""Feedback to the operator: notices of trouble and changes, held gestures and warnings."""
+"""Feedback to the operator: notices, current gestures and warnings."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from xop_lerobot.retarget.online import AppliedChange
 
 SLOW_HZ = 25.0
-"""Rate of a stream under which gestures are missed [Hz]."""
+"""Stream rate below which gestures are missed [Hz]."""
 LATE_S = 0.3
-"""Age of a plan from which the robot lags behind what is asked of it [s]."""
+"""Plan age above which the robot lags noticeably [s]."""
 
 
 class Feedback:
-    """What the operator is told, and shown in each tick.
+    """Notices to the operator, and the display of each tick.
 
     Attributes:
-        board: The last notices.
-        shown: Content of the display but for notices and progress, None before the first tick.
+        board: Latest notices.
+        shown: Display without notices and progress, None before the first tick.
     """
 
     def __init__(self) -> None:
@@ -41,23 +41,23 @@ class Feedback:
         self.reset()
 
     def reset(self) -> None:
-        """Start over; the notices stay."""
+        """Start over; the notices remain."""
         self._trouble = ""
         self.shown: Display | None = None
 
     @property
     def notice(self) -> str:
-        """What the operator was told last; empty if nothing was."""
+        """Latest notice; empty if there was none."""
         notices = self.board.notices
         return notices[-1].text if notices else ""
 
     def tell_trouble(self, trouble: str, *, engaged: bool, retreats: bool) -> None:
-        """Tell what the robot has begun to do that it was not told to.
+        """Report a new trouble of the robot.
 
         Args:
-            trouble: That, in words; empty if nothing.
-            engaged: Whether the operator has driven until now.
-            retreats: Whether its arms go back to rest for it.
+            trouble: Description of the trouble; empty for none.
+            engaged: Whether the operator was engaged until now.
+            retreats: Whether the robot's arms return to rest because of it.
         """
         if trouble and trouble != self._trouble:
             text = trouble[:1].upper() + trouble[1:]
@@ -77,16 +77,16 @@ class Feedback:
         plan_age: float | None,
         pictures: Mapping[str, np.ndarray],
     ) -> None:
-        """Take down what `show` shows of a tick.
+        """Compose the display of a tick.
 
         Args:
             state: The robot now.
-            frame: The operator now, None before the first frame.
-            engagement: Whether the operator drives, and how long the clutch has been held.
-            raised: Reader of raised hands.
-            mode: Mode that is asked for.
-            plan_age: Age of the plan that is followed [s], None where there is none.
-            pictures: What the robot's cameras see, by name. Shapes (height, width, 3), uint8.
+            frame: The operator's frame, None before the first.
+            engagement: State of the engagement and its clutch.
+            raised: Detector of raised hands.
+            mode: Requested mode.
+            plan_age: Age of the current plan [s], None without one.
+            pictures: Camera images by name. Shapes (height, width, 3), uint8.
         """
         engaged, trouble = engagement.is_engaged, state.trouble
         holding, progress = describe_hold(raised, engagement.progress, engaged=engaged)
@@ -104,14 +104,14 @@ class Feedback:
         )
 
     def show(self, device: Device, progress: Progress | None) -> None:
-        """Show the tick on `device`, with how far a recording is (None without one)."""
+        """Show the tick on `device`, with the progress of a recording (None without one)."""
         if self.shown is not None:
             notices = self.board.notices
             device.show(dataclasses.replace(self.shown, notices=notices, progress=progress))
 
 
 def tell_changes(board: NoticeBoard, changes: Iterable[AppliedChange]) -> None:
-    """Notify of changes in a tick: the mode with its own notice, the rest in one."""
+    """Post notices of the changes in a tick: one for the mode, one for the rest."""
     changed = [each.change for each in changes]
     modes = [change.mode for change in changed if change.mode is not None]
     if modes:
@@ -122,7 +122,7 @@ def tell_changes(board: NoticeBoard, changes: Iterable[AppliedChange]) -> None:
 
 
 def describe_settings(change: Change) -> str:
-    """Describe `change` except for the mode; empty if there is nothing else."""
+    """Describe `change` without the mode; empty if nothing else changes."""
     parts = [
         f"constraint {name} {'on' if on else 'off'}" for name, on in change.constraints.items()
     ]
@@ -140,15 +140,15 @@ def describe_settings(change: Change) -> str:
 
 
 def describe_hold(raised: RaisedHands, clutch: float, *, engaged: bool) -> tuple[str, float]:
-    """Describe the gesture that is held.
+    """Describe the current gesture.
 
     Args:
-        raised: Reader of raised hands, which go before the clutch.
-        clutch: How much of the clutch's hold has passed, from 0 to 1.
-        engaged: Whether the operator drives.
+        raised: Detector of raised hands, which take precedence over the clutch.
+        clutch: Elapsed share of the clutch's hold, from 0 to 1.
+        engaged: Whether the operator is engaged.
 
     Returns:
-        What it will do, in words, and how much of its hold has passed; empty and 0 without one.
+        Its effect, and the elapsed share of its hold; empty and 0 without one.
     """
     if raised.request is not None:
         return HOLDING[raised.request], raised.progress
@@ -165,14 +165,14 @@ def list_warnings(
     plan_age: float | None,
     trouble: str = "",
 ) -> tuple[str, ...]:
-    """List the present warnings, the worst first.
+    """List the present warnings, most severe first.
 
     Args:
-        device: Where the operator's motion comes from.
-        frame: The operator now, None before the first frame.
-        engaged: Whether the operator drives.
-        plan_age: Age of the plan that is followed [s], None where there is none.
-        trouble: What the robot does that it was not told to; empty if nothing.
+        device: Source of the operator's motion.
+        frame: The operator's frame, None before the first.
+        engaged: Whether the operator is engaged.
+        plan_age: Age of the current plan [s], None without one.
+        trouble: Trouble of the robot; empty for none.
     """
     warnings = [f"{trouble[:1].upper()}{trouble[1:]}."] if trouble else []
     if device.trouble:
@@ -182,7 +182,7 @@ def list_warnings(
         if not device.trouble:
             warnings.append("The headset has lost its position, or sends nothing.")
     elif frame is not None:
-        slow = () if status is None else status.slow_hands  # the device tells of these
+        slow = () if status is None else status.slow_hands  # reported by the device
         tracked = zip(HANDS, frame.tracked[1:], strict=True)
         lost = [side for side, seen in tracked if not seen and side not in slow]
         if lost:

@@ -1,4 +1,4 @@
-"""One sample of a headset's stream, in the convention that all devices convert to."""
+"""One sample of a headset's stream, in the convention of all devices."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class OperatorFrame:
         left_wrist: Pose. Shape (7,).
         right_wrist: Pose. Shape (7,).
         pinch: Distance of thumb and index tip, left and right [m]. Shape (2,).
-        tracked: Whether head, left and right wrist are seen. Shape (3,), bool.
-        mode: The mode that the device itself states (a recording may); None: gestures decide.
+        tracked: Whether head, left and right wrist are tracked. Shape (3,), bool.
+        mode: Mode stated by the device itself (as a recording may); None: gestures decide.
     """
 
     time: float

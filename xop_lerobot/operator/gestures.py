@@ -1,6 +1,6 @@
 """Gestures: double pinches of one or both hands, raised hands, and their effects.
 
-Requests go to the robot (engage, let go, change the mode) and to the recording.
+Their effects concern the robot (engage, disengage, change the mode) and the recording.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GRIP_CLOSED = 0.015
 
 
 def grip_from_pinch(distance: np.ndarray | float) -> np.ndarray:
-    """Closing of a hand, 0 open (≥ 0.06 m) to 1 closed (≤ 0.015 m), linear between.
+    """Closing of a hand: 0 open (≥ 0.06 m), 1 closed (≤ 0.015 m), linear in between.
 
     Args:
         distance: Distance of thumb and index tip [m]. Any shape.
@@ -43,18 +43,18 @@ class DoublePinchConfig:
     """Limits of a double pinch.
 
     Attributes:
-        hand: The hand that toggles, ``"left"`` or ``"right"``.
-        on: A hand closes at this distance of thumb and index tip [m].
-        off: It opens again at this distance [m].
-        min_frames: Fewest samples in which each pinch is closed.
+        hand: Hand that toggles the mode, ``"left"`` or ``"right"``.
+        on: Distance of thumb and index tip at which a hand closes [m].
+        off: Distance at which it opens again [m].
+        min_frames: Least number of samples in which each pinch is closed.
         min_pinch: Shortest pinch [s].
         max_pinch: Longest pinch [s].
         min_gap: Shortest time from release to the next press [s].
-        max_gap: Longest time from release to the next press; a third pinch within it makes the
-            two no double pinch, so the toggle comes that long after the second release [s].
-        refractory: Time after a toggle before the next double pinch may begin [s].
-        max_wrist_speed: Wrist speed over which a pinch is a grasp, not a gesture [m/s].
-        veto: How long a pinch is distrusted after the hand was lost or fast [s].
+        max_gap: Longest time from release to the next press. A third pinch within it cancels the
+            double pinch, so the toggle comes that long after the second release [s].
+        refractory: Time after a toggle before another double pinch may start [s].
+        max_wrist_speed: Wrist speed above which a pinch is a grasp, not a gesture [m/s].
+        veto: Time for which pinches are ignored after the hand was lost or fast [s].
     """
 
     hand: str = "left"
@@ -70,10 +70,10 @@ class DoublePinchConfig:
     veto: float = 0.2
 
     def __post_init__(self) -> None:
-        """Check every value.
+        """Validate all values.
 
         Raises:
-            UnknownName: If `hand` is no hand.
+            UnknownName: If `hand` is not a hand.
             BadValue: If a number is negative, or a pair is in the wrong order.
         """
         fill_nulls(self)
@@ -93,10 +93,9 @@ class DoublePinchConfig:
 class DoublePinchDetector:
     """Distinguishes double pinches from grasps by the stamps of the samples.
 
-    Pinches with at most `max_gap` between them are one burst. A burst of exactly two clean
-    pinches is a double pinch; a pinch that is too short or too long, a hand that is lost or
-    moves fast, spoils its burst. Since only stamps count, a recorded stream replays to the
-    same toggles.
+    Pinches separated by at most `max_gap` form a burst. A burst of exactly two clean pinches is a
+    double pinch; a pinch that is too short or too long, or a hand that is lost or moves fast,
+    invalidates its burst. Only stamps count, so a recorded stream replays with the same toggles.
 
     Args:
         config: Thresholds and durations.
@@ -108,7 +107,7 @@ class DoublePinchDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything seen so far."""
+        """Forget all samples."""
         self._time: float | None = None
         self._wrist: np.ndarray | None = None
         self._closed = False
@@ -119,9 +118,9 @@ class DoublePinchDetector:
         self._distrusted_at = self._toggled_at = -math.inf
 
     def update(self, frame: OperatorFrame) -> bool:
-        """Take one sample; return whether a double pinch is complete with it.
+        """Process one sample; return whether it completes a double pinch.
 
-        Samples with the stamp of the last one are ignored; a stamp that goes back starts anew.
+        Samples with the previous stamp are ignored; an earlier stamp resets the detector.
         """
         if self._time is not None and frame.time < self._time:
             self.reset()
@@ -138,14 +137,14 @@ class DoublePinchDetector:
 
     @property
     def is_busy(self) -> bool:
-        """Whether pinches are seen that may become a double pinch."""
+        """Whether pinches are in progress that may become a double pinch."""
         return self._closed or self._taps > 0
 
     def _is_tracked(self, frame: OperatorFrame) -> bool:
         return bool(frame.tracked[1 + self._hand])
 
     def _is_distrusted(self, frame: OperatorFrame) -> bool:
-        """Whether the hand is lost, was lost for long, or moves fast."""
+        """Whether the hand is lost, had a gap, or moves fast."""
         if not self._is_tracked(frame):
             self._wrist = None
             return True
@@ -181,7 +180,7 @@ class DoublePinchDetector:
         self._taps += 1
 
     def _take_double(self, time: float) -> bool:
-        """Judge the burst once it is over."""
+        """Evaluate the burst once it is over."""
         if self._closed or not self._taps or time - self._released_at <= self.config.max_gap:
             return False
         rested = self._began_at - self._toggled_at >= self.config.refractory
@@ -201,7 +200,7 @@ class Gesture(Enum):
 
 
 OTHER_PINCHES = ("success", "none")
-"""What a double pinch of the hand that does not toggle the mode can do."""
+"""Effects of a double pinch of the hand that does not toggle the mode."""
 
 
 @dataclass
@@ -209,14 +208,14 @@ class GestureConfig:
     """Effects of the gestures.
 
     Attributes:
-        double_pinch: When two pinches of one hand count; they toggle the mode.
-        other_double_pinch: What a double pinch of the other hand does: ``"success"`` marks the
-            episode as a success, or takes the mark off again; or ``"none"``.
+        double_pinch: Thresholds of the double pinch that toggles the mode.
+        other_double_pinch: Effect of a double pinch of the other hand: ``"success"`` marks the
+            episode as a success, or removes the mark; or ``"none"``.
         both_double_pinch: What a double pinch of both hands at once toggles: a constraint
             (`upright`), a preset against `default`, or `none`.
         window: Longest time between the double pinches of the two hands [s].
-        raised: What raised hands ask of the recording.
-        clutch: How somebody in a headset engages the robot, and lets it go.
+        raised: Requests to the recorder by raised hands.
+        clutch: Gesture that engages and disengages.
     """
 
     double_pinch: DoublePinchConfig = field(default_factory=DoublePinchConfig)
@@ -227,10 +226,10 @@ class GestureConfig:
     clutch: ClutchConfig = field(default_factory=ClutchConfig)
 
     def __post_init__(self) -> None:
-        """Check the values of its own.
+        """Validate the values not validated by its parts.
 
         Raises:
-            UnknownName: If there is nothing of that name to toggle.
+            UnknownName: If there is no such effect.
             BadValue: If the window is not positive.
         """
         known = ("none", *CONSTRAINTS, *PRESETS)
@@ -248,11 +247,11 @@ class GestureConfig:
 class GestureReader:
     """Distinguishes double pinches of one hand from those of both.
 
-    The double pinch of one hand counts at once, unless the other hand is just pinching too or
-    has just done so: then it counts when that is decided, as one of both hands or of its own.
+    The double pinch of one hand counts at once, unless the other hand is or was just pinching: then
+    it counts once decided, as one of both hands or of its own.
 
     Args:
-        config: The hand that toggles, its thresholds and durations, and the window.
+        config: Hand that toggles, thresholds and window.
     """
 
     def __init__(self, config: GestureConfig | None = None) -> None:
@@ -267,13 +266,13 @@ class GestureReader:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything seen so far."""
+        """Forget all samples."""
         for detector in self._detectors.values():
             detector.reset()
-        self._pending: dict[Gesture, float] = {}  # since when one is not decided yet
+        self._pending: dict[Gesture, float] = {}  # start times of undecided gestures
 
     def update(self, frame: OperatorFrame) -> Gesture | None:
-        """Take one sample; return the gesture that is complete with it, None for none."""
+        """Process one sample; return the gesture it completes, None if none."""
         for gesture, detector in self._detectors.items():
             if detector.update(frame):
                 self._pending[gesture] = frame.time
@@ -291,24 +290,24 @@ class GestureReader:
         return None
 
 
-class Asked(NamedTuple):
-    """Requests of the gestures completed by a frame."""
+class Effects(NamedTuple):
+    """Effects of the gestures completed by a frame."""
 
     mode: bool = False
-    """To toggle the mode."""
+    """Whether to toggle the mode."""
     toggle: str = ""
-    """To toggle a constraint or a preset of this name; empty for none."""
+    """Constraint or preset to toggle; empty for none."""
     requests: tuple[RecordingRequest, ...] = ()
-    """What is asked of the recording."""
+    """Requests to the recorder."""
 
 
 class Hands:
     """Reads all gestures except the clutch's, engaged or not.
 
     Args:
-        config: What the gestures do.
-        has_person: Whether somebody wears a headset now. Recordings and scripts replay as they
-            were recorded, and say nothing about the recording that is made now.
+        config: Effects of the gestures.
+        has_person: Whether a person wears a headset. Recordings and scripts replay their mode
+            gestures, but must not control the present recording.
     """
 
     def __init__(self, config: GestureConfig, *, has_person: bool) -> None:
@@ -317,12 +316,12 @@ class Hands:
         self.raised = RaisedHands(config.raised)
 
     def reset(self) -> None:
-        """Forget everything seen so far."""
+        """Forget all samples."""
         self._pinches.reset()
         self.raised.reset()
 
-    def read(self, frame: OperatorFrame | None) -> Asked:
-        """Take the frame of a tick, None before the first."""
+    def read(self, frame: OperatorFrame | None) -> Effects:
+        """Process the frame of a tick, None before the first."""
         requests = []
         if self._has_person and (request := self.raised.update(frame)) is not None:
             requests.append(request)
@@ -331,11 +330,11 @@ class Hands:
         if pinched is Gesture.OTHER_DOUBLE_PINCH and self._has_person and other == "success":
             requests.append(RecordingRequest.SUCCESS)
         toggles = pinched is Gesture.BOTH_DOUBLE_PINCH and both != "none"
-        return Asked(pinched is Gesture.DOUBLE_PINCH, both if toggles else "", tuple(requests))
+        return Effects(pinched is Gesture.DOUBLE_PINCH, both if toggles else "", tuple(requests))
 
 
 def explain_gestures(config: GestureConfig) -> dict[str, str]:
-    """Explain each gesture in a sentence, by what it does."""
+    """Explain each gesture in a sentence, by its effect."""
     clutch, raised = config.clutch, config.raised
     palms = "turn both palms up, " if clutch.gesture == "palms_up" else ""
     first = config.double_pinch.hand

@@ -1,4 +1,4 @@
-"""Goals: their making, their velocity, and blending when a lost hand is found again."""
+"""Goals of head and hands, their velocities, and blending to hands that are found again."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.gestures import grip_from_pinch
 
 BLEND_S = 1.0
-"""Time in which a hand's goal goes from where it was held to where the hand is [s]."""
+"""Time of blending from a held goal to the tracked hand [s]."""
 SETBACK = 2.0
-"""A loss sets a hand back on its way by so many times as long as it took."""
+"""Factor on the duration of a tracking loss by which a blend is set back [1]."""
 SETBACK_SPEED = 1.0
-"""It does so by no less than the time in which the hand would have gone at this speed [m/s]."""
+"""Speed at which the hand's displacement during a loss counts as a setback [m/s]."""
 
 
 @dataclass(frozen=True)
-class _Way:
-    """A goal that blends towards a hand.
+class _Blend:
+    """Blend of a hand's goal from its held pose to the tracked hand.
 
     Attributes:
-        begin: When it set out, or went on after a loss [s].
-        phase: How much of the whole way's time had passed then, from 0 to 1.
-        offset: Of the goal from the hand then: metres, and a rotation vector [rad]. Shape (6,).
+        begin: Start, or continuation after a loss [s].
+        phase: Elapsed share of the blend at `begin`, from 0 to 1.
+        offset: Offset of the goal from the hand at `begin`: metres, and a rotation vector [rad].
+            Shape (6,).
     """
 
     begin: float
@@ -51,17 +52,16 @@ class _Way:
 class HandBlend:
     """Blends goals of hands from their held pose relative to the head to the tracked hands.
 
-    While a hand is lost its goal stands still (`Alignment`). From the first frame in which it
-    is seen again, and from an engagement on, the goal goes with the hand, at an offset that
-    shrinks to nothing: it is a fraction 1 − u of the first one, u being a minimum jerk.
+    While a hand is lost its goal stands still (`Alignment`). From the first frame in which it is
+    seen again, and from an engagement on, the goal moves with the hand at an offset that shrinks to
+    zero: at phase x it is 1 − u(x) of the first one, where u is minimum-jerk.
 
-    A hand that is lost for a moment, on the way or after it, does not set out anew: it goes on
-    from a phase that is earlier by twice that moment. So hands that come and go at the edge of
-    the view are followed, and one that was lost for long, or is found far from there, comes back
-    slowly.
+    A hand that is lost briefly does not restart its blend: it continues from an earlier phase, set
+    back by `SETBACK` times the duration of the loss. So hands that flicker at the edge of the view
+    are still followed, while one that was lost for long, or is found far away, returns slowly.
 
     Args:
-        duration: Time of a whole way [s].
+        duration: Duration of a full blend [s].
     """
 
     def __init__(self, duration: float = BLEND_S) -> None:
@@ -70,14 +70,14 @@ class HandBlend:
 
     def reset(self) -> None:
         """Forget all hands."""
-        # Poses are from the head along its heading.
+        # Poses are relative to the head, along its heading.
         self._last: dict[str, np.ndarray] = {}  # where the goals were
         self._seen: dict[str, np.ndarray] = {}  # where the hands were seen
         self._lost: dict[str, tuple[float, float]] = {}  # since when, and the phase until then
-        self._ways: dict[str, _Way] = {}
+        self._blends: dict[str, _Blend] = {}
 
     def engage(self, head: np.ndarray, robot: Mapping[str, np.ndarray]) -> None:
-        """Begin where the robot's own hands are.
+        """Start from the robot's present hand poses.
 
         Args:
             head: Pose of the robot's head. Shape (7,).
@@ -111,7 +111,7 @@ class HandBlend:
             if name in goals:
                 goal = pose_multiply(pose_inverse(level), goals[name])
                 local = self._lead(time, name, goal, seen)
-                if local is not goal:  # a goal that is followed stays as it is to the last bit
+                if local is not goal:  # an unblended goal is passed on bit for bit
                     blended[name] = pose_multiply(level, local)
                 self._last[name] = local
         return blended
@@ -127,12 +127,12 @@ class HandBlend:
         self._seen[name] = goal
         phase = self._compute_phase(time, name)
         if phase >= 1:
-            self._ways.pop(name, None)
+            self._blends.pop(name, None)
             return goal
-        way = self._ways[name]
-        share = (1 - compute_minimum_jerk(phase)) / (1 - compute_minimum_jerk(way.phase))
-        turned = quat_multiply(quat_exp(share * way.offset[3:]), goal[3:])
-        return make_pose(goal[:3] + share * way.offset[:3], turned)
+        blend = self._blends[name]
+        share = (1 - compute_minimum_jerk(phase)) / (1 - compute_minimum_jerk(blend.phase))
+        turned = quat_multiply(quat_exp(share * blend.offset[3:]), goal[3:])
+        return make_pose(goal[:3] + share * blend.offset[:3], turned)
 
     def _find(self, time: float, name: str, goal: np.ndarray) -> None:
         """Start or continue blending towards a hand that is seen again."""
@@ -140,14 +140,14 @@ class HandBlend:
         away = float(np.linalg.norm(goal[:3] - self._seen.get(name, goal)[:3]))
         setback = max(SETBACK * (time - since), away / SETBACK_SPEED) / self.duration
         offset = _compute_offset(self._last[name], goal)
-        self._ways[name] = _Way(time, max(phase - setback, 0.0), offset)
+        self._blends[name] = _Blend(time, max(phase - setback, 0.0), offset)
 
     def _compute_phase(self, time: float, name: str) -> float:
         """Elapsed share of a hand's blend, 1 if there is none."""
-        if name not in self._ways:
+        if name not in self._blends:
             return 1.0
-        way = self._ways[name]
-        return min(way.phase + (time - way.begin) / self.duration, 1.0)
+        blend = self._blends[name]
+        return min(blend.phase + (time - blend.begin) / self.duration, 1.0)
 
 
 def _compute_offset(pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
@@ -157,13 +157,13 @@ def _compute_offset(pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
 
 @dataclass
 class GoalVelocityConfig:
-    """How goal velocities are estimated.
+    """Settings of the goal velocity filter.
 
     Attributes:
         time_constant: Time constant of the low-pass filter [s].
-        max_gap: Time between two goals over which the velocity is not known, so zero [s].
-        max_linear: Largest speed that is believed [m/s].
-        max_angular: Largest rotation speed that is believed [rad/s].
+        max_gap: Time between two goals above which the velocity is set to zero [s].
+        max_linear: Limit of the linear velocity [m/s].
+        max_angular: Limit of the angular velocity [rad/s].
     """
 
     time_constant: float = 0.1
@@ -185,12 +185,12 @@ class GoalVelocityConfig:
 class GoalVelocity:
     r"""Low-passed finite differences :math:`v \leftarrow v + (1 - e^{-dt/\tau})(\dot x - v)`.
 
-    The gain follows the time between goals, so the rate of the stream does not matter; a goal
-    with the stamp of the last one is ignored. A tracking jump counts as the largest speed that
-    is believed, and fades with the time constant.
+    The gain depends on the time between goals, so the stream's rate does not matter; a goal with
+    the previous stamp is ignored. A tracking jump is limited to the largest velocity, and decays
+    with the time constant.
 
     Args:
-        config: Time constant and bounds.
+        config: Time constant and limits.
     """
 
     def __init__(self, config: GoalVelocityConfig | None = None) -> None:
@@ -198,7 +198,7 @@ class GoalVelocity:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all goals (at engage): the velocity is zero until two are known."""
+        """Forget all goals (at engage): the velocity is zero until two goals are known."""
         self._time: float | None = None
         self._poses: dict[str, np.ndarray] = {}
         self._velocities: dict[str, np.ndarray] = {}
@@ -235,11 +235,11 @@ class GoalVelocity:
 
 
 class GoalMaker:
-    """Makes the goal of each tick from the frame of an operator who is engaged.
+    """Makes the goal of each tick from the frame of an engaged operator.
 
     Args:
-        has_person: Whether somebody wears a headset now. Hands of recordings and scripts are
-            followed as they are shown, also where they are lost.
+        has_person: Whether a person wears a headset. Hands of recordings and scripts are followed
+            as given, even where they are lost.
     """
 
     def __init__(self, *, has_person: bool) -> None:
@@ -247,11 +247,11 @@ class GoalMaker:
         self._velocity, self._blend = GoalVelocity(), HandBlend()
 
     def reset(self) -> None:
-        """Forget the goals so far."""
+        """Forget all goals."""
         self._velocity.reset()
 
     def engage(self, poses: Mapping[str, np.ndarray]) -> None:
-        """Begin an engagement of a robot whose frames are at `poses`. Shapes (7,)."""
+        """Start an engagement with the robot's frames at `poses`. Shapes (7,)."""
         self._velocity.reset()
         self._blend.reset()
         if self._has_person:
@@ -265,15 +265,15 @@ class GoalMaker:
         mode: Mode,
         freed: Mapping[str, np.ndarray] | None = None,
     ) -> Goal | None:
-        """Make a goal, None while not engaged.
+        """Make a goal; None while not engaged.
 
         Args:
             time: The robot's clock [s].
-            frame: The operator now, None before the first frame.
-            alignment: How the operator is laid on the robot.
-            mode: Mode that is asked for.
-            freed: Poses that a constraint kept from their goals until now, None where none did:
-                hands go from there to their goals slowly. Shapes (7,).
+            frame: The operator's frame, None before the first.
+            alignment: Mapping from the operator to the robot.
+            mode: Requested mode.
+            freed: Poses that a constraint has kept from their goals until now, None otherwise:
+                hands blend from there to their goals. Shapes (7,).
         """
         if frame is None or not alignment.is_engaged:
             return None

@@ -1,4 +1,4 @@
-"""One-euro filter: smooth at rest, little lag in motion."""
+"""One-euro filter: strong smoothing at rest, little lag in motion."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class OneEuroConfig:
     """Settings of the one-euro filter.
 
     Attributes:
-        min_cutoff: Cut-off frequency of what rests [Hz]; lower ones calm more.
-        position_beta: How much the cut-off rises with the speed of a limb [1/m]; higher ones
-            leave less delay in movements.
-        rotation_beta: The same with its rate of turn [1/rad].
-        speed_cutoff: Cut-off frequency of speeds [Hz].
+        min_cutoff: Cut-off frequency at rest [Hz]; lower values smooth more.
+        position_beta: Increase of the cut-off with a limb's speed [1/m]; higher values reduce the
+            lag in motion.
+        rotation_beta: Increase of the cut-off with a limb's turn rate [1/rad].
+        speed_cutoff: Cut-off frequency of the speed estimates [Hz].
     """
 
     min_cutoff: float = 1.0
@@ -43,12 +43,12 @@ class OneEuroConfig:
 
 
 def compute_share(cutoff: float, dt: float) -> float:
-    r"""Share of a new sample, :math:`\alpha = 1 / (1 + 1 / (2 \pi f_c\, dt))` [1]."""
+    r"""Filter gain of a new sample, :math:`\alpha = 1 / (1 + 1 / (2 \pi f_c\, dt))` [1]."""
     return 1 / (1 + 1 / (2 * math.pi * cutoff * dt))
 
 
 class OneEuroPose:
-    r"""A first-order low-pass of a pose whose cut-off rises with its speed.
+    r"""First-order low-pass of a pose whose cut-off rises with its speed.
 
     .. math:: f_c = f_{min} + \beta |\dot{\hat x}|, \qquad
               \hat x_k = \hat x_{k-1} + \alpha(f_c) (x_k - \hat x_{k-1})
@@ -57,7 +57,7 @@ class OneEuroPose:
     rotation vector. The speed is that of the raw pose, itself smoothed.
 
     Args:
-        config: The cut-offs.
+        config: Cut-off frequencies.
 
     References:
         [1] G. Casiez, N. Roussel, D. Vogel: 1€ Filter: A Simple Speed-based Low-pass Filter for
@@ -69,13 +69,13 @@ class OneEuroPose:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the next pose is taken as it is."""
+        """Forget everything: the next pose passes unfiltered."""
         self._time: float | None = None
         self._raw = self._pose = np.zeros(7)
         self._velocity, self._turn = np.zeros(3), np.zeros(3)
 
     def update(self, time: float, pose: np.ndarray) -> np.ndarray:
-        """Take the pose of `time` [s], later than the last; return the smoothed one. Shape (7,)."""
+        """Filter the pose of `time` [s], later than the last one. Shape (7,)."""
         pose = np.asarray(pose, dtype=float)
         if self._time is None:
             self._pose = pose.copy()
@@ -100,7 +100,7 @@ class OneEuroPose:
 
 
 def _compute_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Rotation vector from `start` to `end` by the shorter way [rad]. Shape (3,)."""
+    """Rotation vector from `start` to `end` along the shorter arc [rad]. Shape (3,)."""
     between = quat_multiply(quat_conjugate(start), end)
     return quat_log(between if between[0] >= 0 else -between)
 
@@ -108,10 +108,10 @@ def _compute_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 class OneEuro:
     """Smooths head and wrists of a stream; a lost limb restarts when it is seen again.
 
-    Pinches stay as they are: their thresholds have a hysteresis of their own.
+    Pinches are not filtered: their thresholds have hysteresis.
 
     Args:
-        config: The cut-offs.
+        config: Cut-off frequencies.
     """
 
     def __init__(self, config: OneEuroConfig | None = None) -> None:
@@ -123,7 +123,7 @@ class OneEuro:
             limb.reset()
 
     def smooth(self, frame: OperatorFrame) -> OperatorFrame:
-        """Take a frame, later than the last; return it with its limbs smoothed."""
+        """Smooth the limbs of a frame, later than the last one."""
         poses = {}
         for name, limb, seen in zip(FRAMES, self._limbs, frame.tracked, strict=True):
             if seen:
@@ -134,7 +134,7 @@ class OneEuro:
 
 
 def make_one_euro(smoothing: float) -> OneEuro | None:
-    """Make the filter that smooths `smoothing` times as much as by default; None for 0."""
+    """Make a filter whose cut-offs are divided by `smoothing`; None for 0."""
     if smoothing == 0:
         return None
     c = OneEuroConfig()

@@ -1,4 +1,4 @@
-"""Raised hands: gestures that control the recording."""
+"""Raised hands: gestures that make requests to the recorder."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from xop_lerobot.operator.frame import OperatorFrame
 RAISED = ("left", "right", "both", "none")
 WRISTS = ("left_wrist", "right_wrist")
 UPRIGHT, STILL_UPRIGHT = 0.7, 0.5
-"""Fingers point so far up, and the palm so far forward, as a sine: 45°, and 30° to go on."""
+"""Least vertical component of the fingers and forward component of the palm, to start (45°) and to
+continue (30°)."""
 BELOW_EYES = 0.5
-"""A raised wrist is no farther below the eyes [m]."""
+"""Largest depth of a raised wrist below the eyes [m]."""
 REQUESTS = {
     "end": RecordingRequest.END,
     "redo": RecordingRequest.REDO,
@@ -29,23 +30,23 @@ HOLDING = {
     RecordingRequest.REDO: "Hold on to discard the episode",
     RecordingRequest.STOP: "Hold on to stop the session",
 }
-"""What somebody who holds a gesture is told."""
+"""Text shown while a gesture is held."""
 
 
 @dataclass
 class RaisedHandsConfig:
-    """Hand of each request, ``"left"``, ``"right"``, ``"both"`` or ``"none"``.
+    """Hands of each request: ``"left"``, ``"right"``, ``"both"`` or ``"none"``.
 
     Attributes:
-        end: Raised to end the episode: it is saved.
+        end: Raised to end and save the episode.
         redo: Raised to discard the episode and record it again.
         stop: Raised to end the session.
-        hold: How long `end` is held [s].
-        long_hold: How long `redo` and `stop` are held, which cannot be undone [s].
-        on: A hand closes at this distance of thumb and index tip [m].
-        off: It opens again at this distance [m].
-        slack: A hand that is held stays within this distance of where it closed [m].
-        max_gap: Longest time between two frames over which a gesture goes on [s].
+        hold: Hold time of `end` [s].
+        long_hold: Hold time of `redo` and `stop`, which cannot be undone [s].
+        on: Distance of thumb and index tip at which a hand closes [m].
+        off: Distance at which it opens again [m].
+        slack: Largest motion of a held hand from where it closed [m].
+        max_gap: Longest time between two frames that continues a gesture [s].
     """
 
     end: str = "right"
@@ -59,12 +60,12 @@ class RaisedHandsConfig:
     max_gap: float = 0.2
 
     def __post_init__(self) -> None:
-        """Check every value.
+        """Validate all values.
 
         Raises:
-            UnknownName: If there are no such hands, with the known ones.
-            BadValue: If a number is not above 0, `on` is not below `off`, or the same hands
-                are raised for two things.
+            UnknownName: If there are no such hands, listing the known ones.
+            BadValue: If a number is not above 0, `on` is not below `off`, or two requests have the
+                same hands.
         """
         for name in REQUESTS:
             setattr(self, name, find_word(getattr(self, name), RAISED))
@@ -87,10 +88,10 @@ class RaisedHandsConfig:
 
 
 class _Hand:
-    """One hand: whether it is raised, and whether it has closed since.
+    """State of one hand: raised, and closed since.
 
-    Only a pinch that began in a raised hand counts, so a hand that carries something makes no
-    gesture, however it is turned.
+    Only a pinch that starts in a raised hand counts, so a hand that carries something makes no
+    gesture in any orientation.
     """
 
     def __init__(self, name: str, config: RaisedHandsConfig) -> None:
@@ -103,7 +104,7 @@ class _Hand:
 
     @property
     def closed(self) -> bool:
-        """Whether it has closed while it was raised, and was held still since."""
+        """Whether it has closed while raised, and was still since."""
         return self._place is not None
 
     def follow(self, frame: OperatorFrame, forward: np.ndarray, pinch: float) -> None:
@@ -124,20 +125,19 @@ class _Hand:
             self._place = wrist[:3].copy()
 
     def spend(self) -> None:
-        """Mark the gesture as used; the next one begins with an open hand."""
+        """Mark the gesture as used; the next one starts with an open hand."""
         self._ready, self._place = False, None
 
 
 class RaisedHands:
-    """Detects from the frames the operator's requests to the recorder.
+    """Detects requests to the recorder by raised hands.
 
-    A hand is raised as if to say "halt": fingers up, palm away from the person. It closes
-    thumb and index there, and is held still. What is asked for depends on which hands are
-    raised. Head and both hands must be seen. Only stamps count, so that a recorded stream
-    replays to the same gestures.
+    A hand is raised as in a "halt" sign: fingers up, palm away from the person. It pinches there
+    and is held still. The request depends on which hands are raised. Head and both hands must be
+    tracked. Only stamps count, so a recorded stream replays with the same gestures.
 
     Args:
-        config: Which hand is raised for what, and for how long.
+        config: Hand and hold time of each request.
     """
 
     def __init__(self, config: RaisedHandsConfig | None = None) -> None:
@@ -149,7 +149,7 @@ class RaisedHands:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything seen so far."""
+        """Forget all samples."""
         self._time: float | None = None
         self._stop()
 
@@ -157,18 +157,18 @@ class RaisedHands:
         for hand in self._hands:
             hand.reset()
         self.request: RecordingRequest | None = None
-        """What the gesture that is held asks for, None if none is held."""
+        """Request of the current gesture, None if none is held."""
         self._since = 0.0
         self.progress = 0.0
-        """How much of its hold has passed, from 0 to 1."""
+        """Elapsed share of its hold, from 0 to 1."""
 
     def update(self, frame: OperatorFrame | None) -> RecordingRequest | None:
-        """Take one sample; return its request, once per gesture.
+        """Process one sample; return its request, once per gesture.
 
-        Frames with the stamp of the last one change nothing; a stamp that goes back starts anew.
+        Frames with the previous stamp change nothing; an earlier stamp resets the detector.
 
         Args:
-            frame: The operator now, None before the first.
+            frame: The operator's frame, None before the first.
         """
         if frame is None or not frame.tracked.all():
             self.reset()
@@ -192,7 +192,7 @@ class RaisedHands:
             self.progress = 0.0
             return None
         length = self.config.hold if request is RecordingRequest.END else self.config.long_hold
-        # Stamps add up rounding; a microsecond must not cost a sample.
+        # Sums of stamps round; a microsecond of tolerance saves waiting for another sample.
         self.progress = min((time - self._since + 1e-6) / length, 1.0)
         if self.progress < 1:
             return None
@@ -202,7 +202,7 @@ class RaisedHands:
         return request
 
     def _find_request(self) -> RecordingRequest | None:
-        """Present request of the hands; all raised hands must be closed."""
+        """Return the present request; all raised hands must be closed."""
         raised = [hand.raised for hand in self._hands]
         if not any(raised) or [hand.closed for hand in self._hands] != raised:
             return None

@@ -21,14 +21,15 @@ PINCH_KEYS = ("left_pinch", "right_pinch")
 REQUIRED_KEYS = ("t", *POSE_KEYS, *PINCH_KEYS)
 OPTIONAL_KEYS = ("tracked", "mode")
 NORM_TOLERANCE = 1e-3
-"""How far a quaternion's norm may be from 1 before it counts as a fault."""
+"""Largest accepted deviation of a quaternion's norm from 1."""
 MIN_SAMPLES = 2
 LONGEST_STEP_S = 60.0
-"""Samples of a motion are never farther apart [s]: a clock was set, or counts in other units."""
+"""Longest accepted time between samples [s]; a longer one means an adjusted clock, or other
+units."""
 FARTHEST_M = 10_000.0
-"""Farthest from the origin of its world that a person may be along an axis [m]. Datasets keep
-positions in 32 bits, as LeRobot shows them, which are exact to a millimetre up to there; in the
-coordinates of a map they are off by half a metre."""
+"""Largest accepted distance from the origin along an axis [m]. Datasets store positions as float32,
+as LeRobot loads them, which resolves a millimetre up to there; map coordinates would be off by half
+a metre."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,9 @@ class Recording:
         t: Times, strictly increasing from 0 [s]. Shape (T,).
         poses: Head, left and right wrist, x y z qw qx qy qz. Shape (T, 3, 7).
         pinch: Distance of thumb and index tip, left and right [m]. Shape (T, 2).
-        tracked: Whether each limb was seen. Shape (T, 3), bool.
-        mode: 0 stationary, 1 mobile; None where the recording states none. Shape (T,).
-        engaged: Whether the person drove; None where they did all the time. Shape (T,), bool.
+        tracked: Whether each limb was tracked. Shape (T, 3), bool.
+        mode: 0 stationary, 1 mobile; None if the recording states no modes. Shape (T,).
+        engaged: Whether the person was engaged; None if always. Shape (T,), bool.
     """
 
     t: np.ndarray
@@ -53,22 +54,23 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Length [s]."""
+        """Duration [s]."""
         return float(self.t[-1])
 
     def is_engaged_at(self, stamp: float) -> bool:
-        """Whether the person drove at `stamp` [s]: as in the last sample before."""
+        """Whether the person was engaged at `stamp` [s], by the last sample before it."""
         if self.engaged is None:
             return True
-        # Lock-step clocks add up rounding; a nanosecond must not cost a tick.
+        # Sums of lock-step periods round; a nanosecond of tolerance saves a tick.
         last = np.searchsorted(self.t, stamp + 1e-9, side="right") - 1
         return bool(self.engaged[max(int(last), 0)])
 
     def frame_at(self, stamp: float) -> OperatorFrame:
-        r"""Interpolate at any time; before the first and after the last sample these are held.
+        r"""Interpolate at any time; the first and last sample are held beyond the ends.
 
-        Positions are linear, orientations :math:`q_0 \exp(u \log(q_0^{-1} q_1))` along the
-        shorter arc; flags and mode are those of the nearest sample and of the last one.
+        Positions are interpolated linearly, orientations as :math:`q_0 \exp(u \log(q_0^{-1} q_1))`
+        along the shorter arc; `tracked` is that of the nearest sample, the mode that of the last
+        one.
 
         Args:
             stamp: Time on the recording's clock [s].
@@ -110,7 +112,7 @@ def load_recording(path: str | Path) -> Recording:
         )
     try:
         with np.load(path, allow_pickle=False) as archive:
-            # Foreign keys are neither needed nor read: they may hold what we refuse to unpickle.
+            # Other keys are not read: they may contain pickled objects, which are refused.
             names = [key for key in (*REQUIRED_KEYS, *OPTIONAL_KEYS) if key in archive.files]
             missing = [key for key in REQUIRED_KEYS if key not in names]
             if missing:
@@ -128,14 +130,14 @@ def load_recording(path: str | Path) -> Recording:
 
 
 def make_recording(arrays: Mapping[str, np.ndarray], source: object) -> Recording:
-    """Check the arrays of a recording and make it.
+    """Validate the arrays of a recording and make it.
 
     Args:
         arrays: The required and optional keys of an operator recording.
-        source: What they came from, for the messages.
+        source: Their origin, for messages.
 
     Raises:
-        BadRecording: Naming the first fault and where it is.
+        BadRecording: Naming the first fault and its place.
     """
     t = _check_array(arrays, "t", (None,), source)
     n = len(t)
@@ -167,14 +169,14 @@ def make_recording(arrays: Mapping[str, np.ndarray], source: object) -> Recordin
 
 
 def hold_untracked(poses: np.ndarray, tracked: np.ndarray) -> np.ndarray:
-    """Replace each untracked pose by the last tracked one (the first one at the beginning).
+    """Replace each untracked pose by the last tracked one (at the start by the first).
 
     Args:
         poses: Shape (T, 3, 7).
         tracked: Shape (T, 3), bool.
 
     Returns:
-        Poses in which a limb that is not seen stands still. Shape (T, 3, 7).
+        Poses in which an untracked limb stands still. Shape (T, 3, 7).
     """
     held = poses.copy()
     index = np.arange(len(poses))
@@ -223,7 +225,7 @@ def _check_poses(arrays: Mapping[str, np.ndarray], key: str, n: int, source: obj
 
 
 def _check_distances(poses: np.ndarray, source: object) -> None:
-    """Check that positions are near enough to the origin for a dataset. Shape (T, 3, 7)."""
+    """Check that positions are near enough to the origin for float32. Shape (T, 3, 7)."""
     distances = np.abs(poses[:, :, :3]).max(axis=2)
     if (distances > FARTHEST_M).any():
         i, limb = np.unravel_index(int(np.argmax(distances)), distances.shape)
@@ -231,10 +233,10 @@ def _check_distances(poses: np.ndarray, source: object) -> None:
 
 
 def describe_distance(name: str, distance: float) -> str:
-    """Say of a position that it is too far from the origin, and what to do.
+    """Explain that a position is too far from the origin, and what to do.
 
     Args:
-        name: Which.
+        name: Name of the position.
         distance: Its largest coordinate [m].
     """
     return (

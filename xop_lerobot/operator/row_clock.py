@@ -1,4 +1,4 @@
-"""Time of recorded rows by a clock that may have been set during the recording."""
+"""Time of recorded rows by a clock that may have been adjusted during the recording."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from typing import NamedTuple
 import numpy as np
 
 LONGEST_PAUSE_S = 1.0
-"""A recorder is rarely held up for longer between two rows; a clock that goes on by more was set,
-unless the person has moved meanwhile [s]."""
+"""Longest usual pause of a recorder between two rows; a longer step means an adjusted clock, unless
+the person has moved meanwhile [s]."""
 LONGEST_HOLD_S = 60.0
-"""A recorder is never held up for longer [s]."""
+"""Longest possible pause of a recorder [s]."""
 
 
 class RowClock(NamedTuple):
-    """The times of rows by a clock.
+    """Times of rows by a clock.
 
     Attributes:
-        t: Time of each row since the first, without the jumps [s]. What it is where the clock
-            does not go on means nothing. Shape (n,).
-        goes_on: Whether the clock went on with that row. Shape (n,), bool.
-        jumps: Rows with which it was set, and by how much [s].
+        t: Time of each row since the first, without adjustments [s]; meaningless where `goes_on` is
+            False. Shape (n,).
+        goes_on: Whether the clock advanced with that row. Shape (n,), bool.
+        jumps: Rows at which it was adjusted, with the adjustment [s].
     """
 
     t: np.ndarray
@@ -31,21 +31,21 @@ class RowClock(NamedTuple):
 def read_row_clock(
     ticks: np.ndarray, unit: float = 1.0, moved: np.ndarray | None = None
 ) -> RowClock:
-    """Read a clock without the jumps of its adjustments.
+    """Read a clock without its adjustments.
 
-    A board without a battery begins in 1970 until the network tells the time, and an hour that is
-    wrong is set right: from one row to the next the clock goes back, or on by more than any
-    recorder is held up, and runs on from there. Such a step is taken for a usual one. But where
-    the person is elsewhere after it, they had the time to go there, and it stays. A single row
-    whose stamp is wrong, or with which the clock stands still, has no time instead.
+    A board without a battery starts in 1970 until the network provides the time, and wrong time
+    zones get corrected: between two rows the clock then goes back, or forward by more than any
+    recorder pauses, and continues from there. Such a step is replaced by a usual one. But if the
+    person has moved across it, that time has passed, and the step stays. A single row with a wrong
+    stamp, or at which the clock stands still, gets no time instead.
 
     Args:
-        ticks: What the clock shows. Shape (n,).
-        unit: Seconds that one tick is.
-        moved: Whether the person is elsewhere than in the row before, farther than anybody moves
-            from one row to the next. Shape (n,), bool; nowhere if None.
+        ticks: Clock readings. Shape (n,).
+        unit: Seconds per tick.
+        moved: Whether the person has moved farther since the previous row than possible in one row.
+            Shape (n,), bool; None for nowhere.
     """
-    # Whole nanoseconds since 1970 are too many for a float: from the first on they are not.
+    # Nanoseconds since 1970 exceed a float's precision; differences to the first row do not.
     first = ticks[np.isfinite(ticks)][:1]
     t = np.asarray((ticks - first) * unit, float) if first.size else np.full(len(ticks), np.nan)
     with np.errstate(invalid="ignore"):
@@ -62,7 +62,7 @@ def read_row_clock(
         if last < 0:
             goes_on[row], last = True, row
             continue
-        # However long it stood still before, the rows say how much time has passed.
+        # After a standstill the number of rows tells the elapsed time.
         expected = (row - last) * usual
         step = t[row] + shift - t[last]
         pause = LONGEST_HOLD_S if moved is not None and moved[row] else LONGEST_PAUSE_S

@@ -1,4 +1,4 @@
-"""A scripted person: timed waypoints for head and wrists, read from a small YAML file."""
+"""Scripted operator: timed waypoints of head and wrists, read from a small YAML file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.operator.recording import FARTHEST_M, describe_distance
 
 SCRIPTS = Path(__file__).parent / "scripts"
-"""Where the built-in scripts are."""
+"""Folder of the built-in scripts."""
 OPEN_PINCH = 0.08
 """Distance of thumb and index tip of an open hand [m]."""
 CLOSED_PINCH = 0.008
@@ -27,13 +27,13 @@ KEYS = (
     "description", "duration", "wrists_in", *FRAMES, "double_pinches", "pinch", "modes",
 )  # fmt: skip
 WAYPOINT_KEYS = ("t", "position", "rpy_deg", "quat")
-# A double pinch: each finger closing and opening takes TAP_S, as does staying closed.
+# A double pinch: closing, holding and opening each take TAP_S; the second starts at SECOND_TAP_S.
 TAP_S = 0.08
 SECOND_TAP_S = 0.36
 
 
 class BadScript(XopError, ValueError):
-    """An operator script is missing or malformed; names the file, the place and the fault."""
+    """An operator script is missing or malformed; the message names file, place and fault."""
 
     def __init__(self, path: object, fault: str) -> None:
         super().__init__(f"operator script '{path}': {fault}")
@@ -41,18 +41,18 @@ class BadScript(XopError, ValueError):
 
 @dataclass(frozen=True)
 class Track:
-    """Waypoints passed at rest, one minimum-jerk movement from each to the next.
+    """Waypoints with zero velocity, connected by minimum-jerk movements.
 
     Attributes:
         times: Times [s], increasing. Shape (K,).
-        values: Poses (K, 7), or numbers (K, n) that are interpolated one by one.
+        values: Poses (K, 7), or numbers (K, n) that are interpolated individually.
     """
 
     times: np.ndarray
     values: np.ndarray
 
     def at(self, time: float) -> np.ndarray:
-        """Value at `time` [s]; the outermost waypoints are held. Shape of one value."""
+        """Value at `time` [s]; the outermost waypoints are held. Shape (7,) or (n,)."""
         i = int(np.searchsorted(self.times, time, side="right")) - 1
         if i < 0 or i + 1 >= len(self.times):
             return self.values[0 if i < 0 else -1].copy()
@@ -68,13 +68,13 @@ class Script:
     """Content of an operator script.
 
     Attributes:
-        duration: Length [s].
+        duration: Duration [s].
         tracks: Head and wrists by name.
-        wrists_in_body: Whether wrists are given from the head, along its heading, instead of
-            in the operator's world.
-        pinch: Distances of thumb and index tip [m], left and right.
+        wrists_in_body: Whether wrists are relative to the head, along its heading, instead of in
+            the operator's world.
+        pinch: Distances of thumb and index tip, left and right [m].
         double_pinches: Time [s] and hand (0 left, 1 right) of each.
-        modes: Time [s] and mode of each change that the script states itself.
+        modes: Time [s] and mode of each change stated by the script.
     """
 
     duration: float
@@ -96,12 +96,12 @@ class Script:
         return distance
 
     def mode_at(self, time: float) -> Mode | None:
-        """The mode that the script states at `time` [s], None before the first."""
+        """Mode stated by the script at `time` [s], None before the first."""
         return next((mode for start, mode in reversed(self.modes) if time >= start), None)
 
 
 def list_scripts() -> list[str]:
-    """Names of the built-in scripts."""
+    """Return the names of the built-in scripts."""
     return sorted(path.stem for path in SCRIPTS.glob("*.yaml"))
 
 
@@ -109,12 +109,12 @@ def load_script(name: str) -> Script:
     """Read a script.
 
     Args:
-        name: A YAML file, or the name of a built-in script.
+        name: Path of a YAML file, or name of a built-in script.
 
     Raises:
         BadScript: If there is no such script, or it is malformed.
     """
-    import yaml  # noqa: PLC0415 (only who runs scripts needs it)
+    import yaml  # noqa: PLC0415 only scripts need it
 
     path = Path(name).expanduser()
     if not path.is_file() and name in list_scripts():
@@ -131,10 +131,10 @@ def load_script(name: str) -> Script:
 
 
 def make_script(content: object, source: object = "(inline)") -> Script:
-    """Check the content of a script and make it.
+    """Validate the content of a script and make it.
 
     Raises:
-        BadScript: Naming the first fault and where it is.
+        BadScript: Naming the first fault and its place.
     """
     reader = _Reader(source)
     table = reader.table("the script", content, KEYS, required=FRAMES)
@@ -158,7 +158,7 @@ def make_script(content: object, source: object = "(inline)") -> Script:
 
 
 class _Reader:
-    """Reads checked values; every fault names the script and the place in it."""
+    """Reads and validates values; every error names the script and the place."""
 
     def __init__(self, source: object) -> None:
         self.source = source
@@ -212,7 +212,7 @@ class _Reader:
         return str(value)
 
     def poses(self, name: str, value: object) -> Track:
-        """Read waypoints; what one leaves out stays as in the one before."""
+        """Read waypoints; omitted values are those of the previous one."""
         rows = self.rows(name, value, WAYPOINT_KEYS, required=("t",))
         if not rows or "position" not in rows[0][2]:
             raise BadScript(self.source, f"{name} must start with a waypoint that has a position")

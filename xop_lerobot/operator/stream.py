@@ -1,4 +1,4 @@
-"""Plausibility checks of a live stream: each limb is checked, and each rejection counted."""
+"""Plausibility checks of a live stream, per limb; each rejection is counted."""
 
 from __future__ import annotations
 
@@ -24,25 +24,26 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.operator.frame import OperatorFrame
 
 MIN_STEP_TIME = 1 / 90
-"""However close behind each other two frames come, so much lies between what they show [s]."""
+"""Lower bound on the time between two frames for the motion limits, since stamps jitter [s]."""
 MAX_STEP_TIME = 0.04
-"""However long nothing was believed, a limb has moved for no longer than that [s]."""
+"""Upper bound on the time for a limb's motion, however long nothing was accepted [s]."""
 MAX_BODY_TIME = 0.1
-"""The same of a whole body, which people turn on purpose and with a network that stalls [s]."""
+"""The same for a turn of the whole body, longer because people turn on purpose while a network
+stalls [s]."""
 RENEWALS = 5
-"""From so many changes of a pose it is told how often it changes."""
+"""Number of pose changes from which their rate is measured."""
 RENEWAL_S = 0.5
-"""A pose that has not changed for so long stands [s]."""
+"""Time without a change after which a pose is constant [s]."""
 ARM = 0.2
-"""A turn counts like the way of a point so far from the wrist [m]."""
+"""Lever arm by which a rotation is compared with a translation [m]."""
 NORM_TOLERANCE = 1e-2
-"""How far a quaternion's norm may be from 1."""
+"""Largest deviation of a quaternion's norm from 1."""
 SPACE = 100.0
-"""Farther from the origin of its space nobody is [m]."""
+"""Largest plausible distance from the origin along an axis [m]."""
 MAX_PINCH = 0.4
-"""Thumb and index are never farther apart [m]."""
+"""Largest plausible distance of thumb and index [m]."""
 OPEN_PINCH = 0.08
-"""Distance of thumb and index of a hand of which none was seen yet [m]."""
+"""Distance of thumb and index assumed before a hand is first seen [m]."""
 
 
 @dataclass
@@ -50,20 +51,20 @@ class GuardConfig:
     """Limits of the plausibility checks.
 
     Attributes:
-        stale: Without a new believable frame for so long, the head counts as lost [s].
-        frozen: A hand whose pose does not change by a bit for so long, while others do, is
-            lost: devices go on sending the last one [s].
-        settle: A limb that has jumped is believed again when it went on smoothly from there
-            for so long; the head only after `stale` more, so that an engagement ends first [s].
-        head_speed: The head is never faster [m/s].
-        hand_speed: A hand is never faster [m/s].
-        head_turn: The head never turns faster [rad/s].
-        hand_turn: A hand never turns faster [rad/s].
-        body_turn: Head and hands never turn faster together, as the whole person does [rad/s].
-        slack: A jump up to this long is noise [m].
-        head_slack: A jump of the head up to this angle is noise [rad].
-        turn_slack: A jump of a hand up to this angle is noise [rad].
-        reach: A hand is never farther from the head [m].
+        stale: Time without an accepted frame after which the head counts as lost [s].
+        frozen: Time without any change of a hand's pose, while the stream continues, after which
+            the hand is lost: devices keep sending the last pose [s].
+        settle: Time for which a limb must move smoothly after a jump until it is accepted again;
+            for the head `stale` more, so that an engagement ends first [s].
+        head_speed: Largest speed of the head [m/s].
+        hand_speed: Largest speed of a hand [m/s].
+        head_turn: Largest turn rate of the head [rad/s].
+        hand_turn: Largest turn rate of a hand [rad/s].
+        body_turn: Largest turn rate of head and hands together, as of the whole person [rad/s].
+        slack: Position tolerance for noise [m].
+        head_slack: Rotation tolerance of the head for noise [rad].
+        turn_slack: Rotation tolerance of a hand for noise [rad].
+        reach: Largest distance of a hand from the head [m].
     """
 
     stale: float = 0.25
@@ -91,7 +92,7 @@ class GuardConfig:
 
 
 def _find_nonsense(pose: np.ndarray) -> str | None:
-    """Reason why `pose` is impossible, None if it is possible. Shape (7,)."""
+    """Return why `pose` is impossible, None if it is possible. Shape (7,)."""
     if not np.isfinite(pose).all():
         return "not_finite"
     if abs(float(np.linalg.norm(pose[3:])) - 1) > NORM_TOLERANCE:
@@ -102,17 +103,17 @@ def _find_nonsense(pose: np.ndarray) -> str | None:
 class LimbGuard:
     r"""Checks the successive poses of one limb.
 
-    A pose is a jump if it is farther from the last believed one than
-    :math:`v_{max} dt + slack`, dt from 1/90 to 0.04 s, or turned by more than the like. Poses that
-    go on smoothly from a jump are believed again after `settle`, and not before: that time passes
-    does not make a motion of a jump.
+    A pose is a jump if its distance from the last accepted one exceeds :math:`v_{max} dt + slack`,
+    with dt limited to 1/90 to 0.04 s, or its rotation the corresponding limit. Poses that continue
+    smoothly after a jump are accepted after `settle`, not before: elapsed time alone does not turn
+    a jump into a motion.
 
     Args:
         speed: Largest speed [m/s].
-        turn: Largest rate of turn [rad/s].
-        settle: How long a new place must last [s].
-        slack: A jump up to this long is noise [m].
-        turn_slack: A jump up to this angle is noise [rad].
+        turn: Largest turn rate [rad/s].
+        settle: Time for which a new place must persist [s].
+        slack: Position tolerance for noise [m].
+        turn_slack: Rotation tolerance for noise [rad].
     """
 
     def __init__(
@@ -121,7 +122,7 @@ class LimbGuard:
         self._speed, self._turn, self._settle = speed, turn, settle
         self._slack, self._turn_slack = slack, turn_slack
         self.pose: np.ndarray | None = None
-        """The last pose that was believed. Shape (7,)."""
+        """Last accepted pose. Shape (7,)."""
         self._time = 0.0
         self._raw = np.full(7, np.nan)
         self._changed_at = 0.0
@@ -129,18 +130,18 @@ class LimbGuard:
         self._candidate: tuple[float, np.ndarray] | None = None
         self._candidate_since = 0.0
         self.relocations = 0
-        """How often a jump has turned out to be where the limb is now."""
+        """Number of jumps accepted as the limb's new place."""
 
     def judge(
         self, time: float, pose: np.ndarray, frozen: float, jumped: bool = False
     ) -> str | None:
-        """Check the pose of `time` [s]; return the reason of a rejection, None if it is accepted.
+        """Check the pose of `time` [s]; return the reason of a rejection, None if accepted.
 
         Args:
             time: Stamp of the frame [s].
             pose: x y z qw qx qy qz. Shape (7,).
             frozen: Time without any change after which the limb is lost [s].
-            jumped: Whether it is known from elsewhere that the limb has jumped.
+            jumped: Whether the limb is known to have jumped.
         """
         reason = _find_nonsense(pose)
         if reason is not None:
@@ -179,7 +180,7 @@ class LimbGuard:
             return True
         if self._candidate is None:
             return False
-        # It could have come here by now, but is still where it has jumped to.
+        # Within the motion limits by now, but still nearer to where it jumped to: not back.
         steps = (compute_step(last, pose) for last in (self._candidate[1], self.pose))
         (moved, turned), (moved_back, turned_back) = steps
         return moved + ARM * turned < moved_back + ARM * turned_back
@@ -193,19 +194,19 @@ class LimbGuard:
 
 
 def compute_step(last: np.ndarray, pose: np.ndarray) -> tuple[float, float]:
-    """Distance [m] and angle [rad] between two poses. Shapes (7,)."""
+    """Compute distance [m] and angle [rad] between two poses of shape (7,)."""
     turn = rotation_error(pose[3:], last[3:])
     return float(np.linalg.norm(pose[:3] - last[:3])), float(np.linalg.norm(turn))
 
 
 def goes_along(before: np.ndarray, after: np.ndarray, last: np.ndarray, pose: np.ndarray) -> bool:
-    """Whether a hand has moved with the head, as on one rigid body, rather than stayed.
+    """Whether a hand moved rigidly with the head rather than staying in place.
 
     Args:
-        before: Pose of the head. Shape (7,).
-        after: The same later. Shape (7,).
-        last: Pose of the hand, with `before`. Shape (7,).
-        pose: Pose of the hand, with `after`. Shape (7,).
+        before: Head pose. Shape (7,).
+        after: Later head pose. Shape (7,).
+        last: Hand pose at `before`. Shape (7,).
+        pose: Hand pose at `after`. Shape (7,).
     """
     turn = quat_multiply(after[3:], quat_conjugate(before[3:]))
     there, back = make_pose(after[:3], turn), make_pose(before[:3], np.array([1.0, 0, 0, 0]))
@@ -217,27 +218,27 @@ def goes_along(before: np.ndarray, after: np.ndarray, last: np.ndarray, pose: np
 class StreamGuard:
     """Turns a device's messages into plausible frames.
 
-    A frame whose head cannot be believed is dropped; when that goes on, the stream is stale. A
-    hand that cannot be believed is marked as lost, and its pose and pinch stay as they were
-    last, so that no bad number gets through. All of it follows the stamps alone.
+    A frame with an implausible head is dropped; if that persists, the stream is stale. An
+    implausible hand is marked as lost and keeps its last pose and pinch, so that no bad number
+    passes. Everything depends on the stamps alone.
 
-    When a headset recentres, its whole space turns and shifts, and nobody has moved. That is told
-    from hands that go along with the head: so quickly nobody turns round as a whole.
+    When a headset recentres, its whole space turns and shifts although nobody has moved. This is
+    detected by hands that turn with the head faster than a person can turn.
 
     Args:
-        config: What counts as a fault.
+        config: Limits.
     """
 
     def __init__(self, config: GuardConfig | None = None) -> None:
         self.config = config or GuardConfig()
         self.counts: Counter[str] = Counter()
-        """How many frames or limbs were refused, by reason; and `taken`, `repeated`."""
+        """Number of rejected frames or limbs by reason; also `taken` and `repeated`."""
         self.reset()
 
     def reset(self) -> None:
-        """Forget what was seen, as after a new connection; the counts stay."""
+        """Forget all frames, as after a new connection; the counts remain."""
         c = self.config
-        # A head that has jumped must be stale for the readers before it is believed again.
+        # A head that has jumped must go stale for the readers before it is accepted again.
         settle = c.settle + c.stale
         self._limbs = [
             LimbGuard(c.head_speed, c.head_turn, settle, c.slack, c.head_slack),
@@ -257,20 +258,19 @@ class StreamGuard:
         return self._limbs[0].relocations
 
     def compute_hand_rates(self, time: float) -> tuple[float | None, float | None]:
-        """How often the poses of left and right hand change [Hz]; None where that is not known."""
+        """Rates at which left and right hand poses change [Hz]; None if unknown."""
         left, right = (limb.compute_rate(time) for limb in self._limbs[1:])
         return left, right
 
     def take(self, frame: OperatorFrame, source_time: float | None = None) -> OperatorFrame | None:
-        """Judge a frame.
+        """Check a frame.
 
         Args:
-            frame: As the device sent it, stamped with the time of its receipt.
-            source_time: The device's own stamp or number, where it has one: only newer frames
-                are taken.
+            frame: The device's frame, stamped with its time of receipt.
+            source_time: The device's own stamp or number, if any: only newer frames are accepted.
 
         Returns:
-            The frame as far as it can be believed, or None if it is dropped.
+            The frame with implausible hands marked as lost, or None if it is dropped.
         """
         reason = self._find_old(frame, source_time)
         if reason is None:
@@ -278,7 +278,7 @@ class StreamGuard:
             if source_time is not None:
                 self._source_time = source_time
             raw = np.concatenate([*(frame.pose(name) for name in FRAMES), frame.pinch])
-            # Devices that outrun their tracking send frames twice, and go on when it has died.
+            # Devices faster than their tracking send frames twice, also after tracking has died.
             if self._raw is not None and np.array_equal(raw, self._raw):
                 reason = "repeated"
             self._raw = raw
@@ -306,7 +306,7 @@ class StreamGuard:
         return None if reason is None else f"head_{reason}"
 
     def _has_space_jumped(self, frame: OperatorFrame) -> bool:
-        """Whether head and hands have turned together by more than a person can."""
+        """Whether head and hands have turned together faster than a person can."""
         last = self._taken
         if last is None or _find_nonsense(frame.head) is not None:
             return False
@@ -332,7 +332,7 @@ class StreamGuard:
                 self.counts[f"{name.removesuffix('_wrist')}_{reason}"] += 1
                 tracked[1 + hand] = False
             limb = self._limbs[1 + hand]
-            # A hand that was never seen is nowhere; it is marked as lost.
+            # Placeholder pose for a hand that was never seen; it is marked as lost.
             wrists.append(frame.head if limb.pose is None else limb.pose)
         self._pinch = pinch
         return dataclasses.replace(

@@ -18,7 +18,7 @@ DEVICES: Registry[Callable[[DeviceConfig], Device]] = Registry(
         "webxr": "xop_lerobot.operator.devices.webxr:WebXrDevice",
     },
 )
-"""Devices by name, each made as ``factory(config)``."""
+"""Factories of devices by name, called as ``factory(config)``."""
 
 
 def make_device(config: DeviceConfig) -> Device:
@@ -26,7 +26,7 @@ def make_device(config: DeviceConfig) -> Device:
 
     Raises:
         UnknownName: Listing the available devices.
-        BadValue: If a setting is out of its range, or one that the device needs is absent.
+        BadValue: If a setting is out of its range, or a required one is missing.
     """
     return DEVICES[config.type](config)
 

@@ -1,8 +1,8 @@
-"""Apple Vision Pro, through its app Tracking Streamer.
+"""Apple Vision Pro with the app Tracking Streamer.
 
-The headset is the server: the rpc `StreamHandUpdates` of `handtracking.HandTrackingService` takes
-one `HandUpdate` and streams more of them. Descriptors are built here, so no generated code is
-needed; both ends of a test use the same ones.
+The headset is the gRPC server: `StreamHandUpdates` of `handtracking.HandTrackingService` takes one
+`HandUpdate` and streams more of them. Message descriptors are built here, so no generated code is
+needed.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ SERVICE = "handtracking.HandTrackingService"
 METHOD = f"/{SERVICE}/StreamHandUpdates"
 PORT = 12345
 DISCOVERY = 888.0
-"""`Head.m00` of a request that names its sender; the app sends zeros to others."""
+"""`Head.m00` of a request that states its sender; the app sends zeros to others."""
 VERSION = "2.50"
-"""The version of the protocol that we speak."""
+"""Protocol version of this client."""
 VERSION_CODE = 25000
-"""`Head.m30` of a request: the same as a number."""
+"""`Head.m30` of a request: the version as a number."""
 SIGNALS = frozenset({666.0, 777.0, 778.0, 888.0, 999.0})
-"""`Head.m00` of messages that hold something else than a head."""
+"""`Head.m00` of messages that contain no head pose."""
 THUMB_TIP, INDEX_TIP = 4, 9
-"""Joints of a skeleton."""
+"""Joint indices of a skeleton."""
 ORTHONORMAL = 0.02
-"""How far R Rᵀ of a rotation may be from the identity."""
+"""Largest deviation of R Rᵀ from the identity for a rotation."""
 
 ENTRIES = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 
-# Columns: our axes in those of the anchor. The head's anchor lies as the world does. That of a
-# left wrist has x towards the fingers, y out of the palm; of a right one both the other way.
+# Columns: our axes in the anchor's frame. The head's anchor is aligned with the world. A left wrist
+# anchor has x towards the fingers and y out of the palm; a right one has both reversed.
 AXES = {
     "head": WORLD.T,
     "left_wrist": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
@@ -78,20 +78,20 @@ def _make_message_class() -> type[Message]:
     add("Skeleton", {"jointMatrices": "Matrix4x4"}, repeated=True)
     add("Hand", {"wristMatrix": "Matrix4x4", "skeleton": "Skeleton"})
     add("HandUpdate", {"left_hand": "Hand", "right_hand": "Hand", "Head": "Matrix4x4"})
-    pool = descriptor_pool.DescriptorPool()  # of its own: other packages may know the same names
+    pool = descriptor_pool.DescriptorPool()  # other packages may define the same names
     pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("handtracking.HandUpdate"))
 
 
 HandUpdate: Any = _make_message_class()
-"""Class of the one message of the protocol; built here, so no checker knows its fields."""
+"""Message class of the protocol; built at runtime, so type checkers do not know its fields."""
 
 
 def make_request(client_ip: str) -> bytes:
-    """Make the request of a stream.
+    """Make the request that starts a stream.
 
     Args:
-        client_ip: Our own IPv4 address, as the headset would see it.
+        client_ip: Own IPv4 address, as seen by the headset.
     """
     request = HandUpdate()
     head = request.Head
@@ -106,8 +106,8 @@ def parse_update(message: bytes) -> OperatorFrame | str:
     """Decode a message of the stream.
 
     Returns:
-        The frame at time 0, in which what is not valid is NaN; or why there is none: `empty` is
-        what the app sends to a client whose version it refuses.
+        The frame at time 0, with NaN for invalid values; or the reason why there is none: `empty`
+        is what the app sends to a client whose version it refuses.
     """
     update = HandUpdate()
     try:
@@ -129,12 +129,12 @@ def parse_update(message: bytes) -> OperatorFrame | str:
 
 
 def read_matrix(message: Message) -> np.ndarray:
-    """Read a `Matrix4x4`, whose entries are m<row><column>. Shape (4, 4)."""
+    """Read a `Matrix4x4`, whose entries are named m<row><column>. Shape (4, 4)."""
     return np.array([getattr(message, entry) for entry in ENTRIES]).reshape(4, 4)
 
 
 def _to_pose(matrix: np.ndarray, name: str) -> np.ndarray:
-    """Pose in the operator's world of an anchor; NaN if the matrix is no pose. Shape (7,)."""
+    """Pose of an anchor in the operator's world; NaN if the matrix is not a pose. Shape (7,)."""
     rotation = matrix[:3, :3]
     if not np.isfinite(matrix).all() or np.abs(rotation).max() > 1 + ORTHONORMAL:
         return np.full(7, np.nan)
@@ -146,7 +146,7 @@ def _to_pose(matrix: np.ndarray, name: str) -> np.ndarray:
 
 
 def _measure_pinch(joints: list[Message]) -> float:
-    """Distance of the tips of thumb and index [m]; NaN without a skeleton."""
+    """Distance of the thumb and index tips [m]; NaN without a skeleton."""
     if len(joints) <= INDEX_TIP:
         return np.nan
     thumb, index = (
@@ -157,20 +157,20 @@ def _measure_pinch(joints: list[Message]) -> float:
 
 
 MAX_MESSAGE = 256 * 1024
-"""Longer messages end the connection; one of two hands has about 5 kB [bytes]."""
+"""Largest message; longer ones end the connection. One with two hands has about 5 kB [bytes]."""
 
 
 class AvpDevice(LiveDevice):
-    """A Vision Pro that runs Tracking Streamer; the headset is the server.
+    """A Vision Pro running Tracking Streamer, which is the server.
 
-    The stream has neither stamps nor flags: frames are stamped at their receipt, and what is
-    lost is told from what no longer changes.
+    The stream has neither stamps nor tracking flags: frames are stamped at receipt, and lost limbs
+    are detected by poses that no longer change.
 
     Args:
-        config: Its settings; `host` is required.
+        config: Device settings; `host` is required.
 
     Raises:
-        BadValue: If there is no host.
+        BadValue: If `host` is missing.
     """
 
     def __init__(self, config: DeviceConfig, clock: Callable[[], float] = time.monotonic) -> None:
@@ -186,7 +186,7 @@ class AvpDevice(LiveDevice):
 
     @property
     def address(self) -> str:
-        """The headset's address."""
+        """Address of the headset."""
         return f"Vision Pro at {self._target}"
 
     def stream(self) -> None:
@@ -198,10 +198,10 @@ class AvpDevice(LiveDevice):
         options = [
             ("grpc.max_receive_message_length", MAX_MESSAGE),
             ("grpc.use_local_subchannel_pool", 1),
-            ("grpc.enable_http_proxy", 0),  # the headset is in the room
+            ("grpc.enable_http_proxy", 0),  # the headset is in the local network
         ]
         with grpc.insecure_channel(self._target, options=options) as channel:
-            # Messages stay bytes here: a bad one is counted, and does not end the stream.
+            # No deserializer: a malformed message is then counted instead of ending the stream.
             call = channel.unary_stream(METHOD)(make_request(find_own_address(self._target)))
             with self._call_lock:
                 self._call = call
@@ -235,7 +235,7 @@ class AvpDevice(LiveDevice):
         self.refuse(frame)
 
     def interrupt(self) -> None:
-        """End the call, if there is one."""
+        """Cancel the call, if there is one."""
         with self._call_lock:
             if self._call is not None:
                 self._call.cancel()

@@ -1,4 +1,4 @@
-"""Settings of operator devices, playback included."""
+"""Settings of operator devices."""
 
 from __future__ import annotations
 
@@ -16,33 +16,30 @@ class DeviceConfig:
 
     Attributes:
         type: ``"replay"`` plays a recorded person, ``"scripted"`` a list of waypoints,
-            ``"simulated"`` is a person who sees the robot and does its task, ``"avp"`` is
-            somebody in an Apple Vision Pro, ``"webxr"`` in any headset that has a browser.
-        path: `replay`: an ``.npz`` recording, or the directory of a recorded dataset.
-            `scripted`: a YAML file, or the name of a script that is built in.
-        mode: Mode in which the operator starts, ``"stationary"`` or ``"mobile"``, where the
-            recording or script states none; None is stationary.
-        episode: `replay` of a dataset: which episode.
-        speed: Playback speed; 0.5 plays at half the speed.
-        hold_s: How long the last frame is held after the end, before the device has
-            finished [s].
-        seed: `scripted`: seed of the person's sway and tremor; `simulated`: of the person.
-        noise: `scripted`, `simulated`: scale of sway and tremor, 0 none, 1 as
-            published for healthy people.
-        host: `avp`: name or address of the headset. `webxr`: address of this machine at which
-            it listens; None is 127.0.0.1, and 0.0.0.0 all of them.
-        port: `avp`: its port; 0 is the one of its app, 12345. `webxr`: port at which it listens;
-            0 is 8012.
-        stale_s: `avp`, `webxr`: without a new pose of the head for so long, the operator has let
-            go [s].
+            ``"simulated"`` is a person who watches the robot and performs its task, ``"avp"`` is a
+            person with an Apple Vision Pro, ``"webxr"`` with any headset that has a browser.
+        path: `replay`: an ``.npz`` recording, or the directory of a recorded dataset. `scripted`: a
+            YAML file, or the name of a built-in script.
+        mode: Initial mode, ``"stationary"`` or ``"mobile"``, if the recording or script states
+            none; None is stationary.
+        episode: `replay` of a dataset: index of the episode.
+        speed: Playback speed; 0.5 is half speed.
+        hold_s: Time the last frame is held before the device is finished [s].
+        seed: `scripted`: seed of sway and tremor; `simulated`: of the person.
+        noise: `scripted`, `simulated`: scale of sway and tremor; 0 is none, 1 as published for
+            healthy people.
+        host: `avp`: name or address of the headset. `webxr`: address of this machine to listen at;
+            None is 127.0.0.1, and 0.0.0.0 is all addresses.
+        port: `avp`: port of the app; 0 is 12345. `webxr`: port to listen at; 0 is 8012.
+        stale_s: `avp`, `webxr`: time without a new head pose after which the operator is disengaged
+            [s].
         tls: `webxr`: whether the page is served over TLS; None: unless it listens on loopback,
-            where browsers ask for none.
-        code: `webxr`: pairing code, at least 6 letters or digits; None makes one for each
-            session.
-        smoothing: `avp`, `webxr`: how much head and wrists are smoothed while they rest, 0 not
-            at all (`OneEuro`).
-        max_delay_s: `webxr`: frames that are older on their arrival are dropped, so that the
-            operator lets go when all are [s].
+            where browsers do not require it.
+        code: `webxr`: pairing code, at least 6 letters or digits; None generates one per session.
+        smoothing: `avp`, `webxr`: strength of smoothing head and wrists at rest; 0 is none
+            (`OneEuro`).
+        max_delay_s: `webxr`: delay above which frames are dropped on arrival; if all are, the
+            operator is disengaged [s].
     """
 
     type: str = "scripted"
@@ -62,11 +59,11 @@ class DeviceConfig:
     smoothing: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check every value.
+        """Validate all values.
 
         Raises:
-            UnknownName: If `mode` is not a mode, with the known ones.
-            BadValue: If a number is out of its range, with the range.
+            UnknownName: If `mode` is not a mode, listing the known ones.
+            BadValue: If a number is out of its range.
         """
         fill_nulls(self)
         if self.mode is not None and self.mode.upper() not in Mode.__members__:
@@ -84,7 +81,7 @@ class DeviceConfig:
 
     @property
     def start_mode(self) -> Mode:
-        """The mode in which the operator starts."""
+        """Initial mode of the operator."""
         return Mode.STATIONARY if self.mode is None else Mode[self.mode.upper()]
 
 

@@ -1,4 +1,4 @@
-"""Common part of live headsets: a thread of their own, the newest frame, and its age."""
+"""Base class of live headsets: receiver thread, latest frame, and reconnection."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ HANDS = ("left", "right")
 RETRY_S = 1.0
 """Time between two attempts to connect [s]."""
 SILENT_S = 2.0
-"""A connection over which nothing came for so long is made anew [s]."""
+"""Time without a message after which a connection is renewed [s]."""
 RATE_WINDOW_S = 1.0
-"""Time over which the rate of the stream is counted [s]."""
+"""Time window over which the stream's rate is counted [s]."""
 HAND_HZ = 1 / GuardConfig.frozen
-"""Rate of a hand's poses under which it counts as lost between one and the next [Hz]."""
+"""Rate of a hand's poses below which it counts as lost between two of them [Hz]."""
 
 
 class StreamLost(XopError):
-    """The stream has ended; the message says how."""
+    """The stream has ended; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -45,17 +45,16 @@ class StreamStatus:
     """Status of a stream.
 
     Attributes:
-        connected: Whether the device answers.
-        age: Time since the last frame that was believed [s]; infinite before the first.
-        rate: Believable frames in the last second [Hz].
-        counts: Frames and limbs by what became of them: `taken`, `repeated`, and every reason
-            for a refusal.
-        connections: How often a connection was made.
-        trouble: What is wrong, in words; empty if nothing is.
-        delay: How old a frame is when it arrives, half of the frames of the last second are
-            older [s]; None where the device cannot tell.
-        hand_rates: How often the poses of left and right hand change, which may be less often
-            than frames come [Hz]; None where a hand stands or is not seen.
+        connected: Whether the device is connected.
+        age: Time since the last accepted frame [s]; infinite before the first.
+        rate: Accepted frames in the last second [Hz].
+        counts: Number of frames and limbs by outcome: `taken`, `repeated`, and every reason for a
+            rejection.
+        connections: Number of connections so far.
+        trouble: Present fault, as text; empty if none.
+        delay: Median delay of the frames of the last second on arrival [s]; None if unknown.
+        hand_rates: Rates at which left and right hand poses change, which may be below the frame
+            rate [Hz]; None if a hand is constant or not tracked.
     """
 
     connected: bool
@@ -78,18 +77,17 @@ class StreamStatus:
 class LiveDevice(Device):
     """A live headset.
 
-    Its stream is read on a thread of its own, as fast as it comes, and each frame is stamped at
-    its receipt, judged and smoothed at once; only the newest is kept. So `read` never waits, and
-    nothing queues up: however slow the readers are, what they get is never older than the stream.
-    When no believable frame came for `stale` seconds, `read` says that nothing is tracked. The
-    connection is made anew by itself whenever it ends.
+    The stream is read by a separate thread at its own rate. Each frame is stamped at receipt,
+    checked and smoothed at once; only the latest is kept. So `read` never blocks and nothing queues
+    up: a slow reader still gets the latest frame. Without an accepted frame for `stale` seconds,
+    `read` returns a frame with nothing tracked. A lost connection is renewed automatically.
 
     A subclass implements `stream` and `interrupt`, and calls `receive` with each frame.
 
     Args:
-        config: Its settings.
-        guard: What counts as a fault of the stream.
-        clock: The clock of the stamps [s].
+        config: Device settings.
+        guard: Limits of the plausibility checks.
+        clock: Clock of the stamps [s].
     """
 
     def __init__(
@@ -104,7 +102,7 @@ class LiveDevice(Device):
         self._filter: OneEuro | None = make_one_euro(config.smoothing)
         self.clock = clock
         self.handled = 0
-        """Messages that were dealt with, of whatever kind."""
+        """Number of processed messages of any kind."""
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -115,7 +113,7 @@ class LiveDevice(Device):
         self._connections = 0
         self._connected = self._left = False
         self._trouble = self._farewell = ""
-        self._log = PacedLog(logger)  # what comes and goes is the other side's doing
+        self._log = PacedLog(logger)  # the peer could flood the log
 
     @property
     @abstractmethod
@@ -127,7 +125,7 @@ class LiveDevice(Device):
         """Connect, and call `hear` and `receive` until the stream ends or is interrupted.
 
         Raises:
-            StreamLost: If it ends, or cannot be connected to.
+            StreamLost: If it ends, or the connection fails.
         """
 
     @abstractmethod
@@ -135,7 +133,7 @@ class LiveDevice(Device):
         """Make `stream` return soon; called from other threads."""
 
     def connect(self) -> None:
-        """Begin to connect, and return at once: the person may put the headset on later."""
+        """Start connecting, and return at once: the person may put the headset on later."""
         if self._thread is not None:
             return
         self._stop.clear()
@@ -159,7 +157,7 @@ class LiveDevice(Device):
                 lost = StreamLost("the stream has ended")
             except StreamLost as error:
                 lost = error
-            except Exception as error:  # the robot holds, whatever it was
+            except Exception as error:  # any error must leave the robot holding
                 self._log.exception("%s: its stream cannot be read", self.address)
                 lost = StreamLost(f"{type(error).__name__}: {error}")
             with self._lock:
@@ -169,7 +167,7 @@ class LiveDevice(Device):
             self._stop.wait(RETRY_S)
 
     def _say(self, trouble: str) -> None:
-        """Warn once of each trouble."""
+        """Set the present trouble; log each new one once."""
         if trouble and trouble != self._trouble:
             self._log.warning(trouble)
         self._trouble = trouble
@@ -180,7 +178,7 @@ class LiveDevice(Device):
             self._heard_at = self.clock()
             if self._connected:
                 return
-            # After a pause somebody else's head may be in it, anywhere.
+            # After a pause another person may wear it, elsewhere.
             self.guard.reset()
             if self._filter is not None:
                 self._filter.reset()
@@ -191,18 +189,18 @@ class LiveDevice(Device):
         self._log.info("%s is connected.", self.address)
 
     def refuse(self, reason: str) -> None:
-        """Count a message that holds no frame."""
+        """Count a message without a usable frame."""
         with self._lock:
             self.guard.counts[reason] += 1
             self.handled += 1
 
     def receive(self, frame: OperatorFrame, source_time: float | None = None) -> None:
-        """Take a frame of the device; its stamp is set here.
+        """Process a frame of the device; it is stamped here.
 
         Args:
-            frame: Head, wrists and pinches in the convention of `OperatorFrame`; what cannot
-                be decoded is NaN.
-            source_time: The device's own stamp or number, where it has one.
+            frame: Head, wrists and pinches in the convention of `OperatorFrame`; undecodable values
+                are NaN.
+            source_time: The device's own stamp or number, if any.
         """
         with self._lock:
             relocations = self.guard.relocations
@@ -221,9 +219,9 @@ class LiveDevice(Device):
             self.handled += 1
 
     def read(self, time: float) -> OperatorFrame | None:
-        """Return the newest frame, or one in which nothing is tracked if it is too old.
+        """Return the latest frame, or one with nothing tracked if it is too old.
 
-        Its time is the host's, on the device's clock, whatever the robot's `time` is.
+        Its time is on the device's clock, independent of the robot's `time`.
         """
         del time
         with self._lock:
@@ -233,7 +231,7 @@ class LiveDevice(Device):
             self._read_relocations = self._relocations
             left = self._left
             if not (moved or left):
-                self._farewell = ""  # whoever was gone is back
+                self._farewell = ""  # the operator is back
             if silent:
                 self._connected = False
         if silent:
@@ -250,10 +248,10 @@ class LiveDevice(Device):
         self.interrupt()
 
     def leave(self, reason: str) -> None:
-        """Note that the operator is gone: nothing is tracked from now on.
+        """Note that the operator has left: nothing is tracked from now on.
 
-        Frames that come after it begin anew. The reason is `trouble` until they are read, however
-        soon that is, so that the operator learns why the robot was let go.
+        Later frames start over. The reason stays in `trouble` until it has been read once, even if
+        frames arrive before, so that the operator learns why the robot disengaged.
         """
         with self._lock:
             self._connected, self._left, self._farewell = False, True, reason
@@ -261,7 +259,7 @@ class LiveDevice(Device):
 
     @property
     def trouble(self) -> str:
-        """Present fault of the stream in words; empty if none."""
+        """Present fault of the stream, as text; empty if none."""
         return self.status.trouble
 
     @property

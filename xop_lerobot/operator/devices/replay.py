@@ -1,4 +1,4 @@
-"""Play a recorded person: an `.npz` recording, or the operator's columns of a dataset."""
+"""Replay of a recorded person: an `.npz` recording, or the operator columns of a dataset."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from xop_lerobot.operator.recording import Recording, load_recording
 
 
 class Player(Device):
-    """A device that plays something of known length.
+    """A device that plays content of known duration.
 
-    Its clock stands at 0 until `start`, then runs at `speed`. Frames are stamped with it, so
-    that gestures come out the same at any playback speed.
+    Its clock stands at 0 until `start`, then runs at `speed`. Frames are stamped by it, so that
+    gestures are the same at any playback speed.
 
     Args:
-        config: Its settings.
+        config: Device settings.
     """
 
     self_engaging = True
@@ -33,14 +33,14 @@ class Player(Device):
     @property
     @abstractmethod
     def duration(self) -> float:
-        """Length of what is played [s on its own clock]."""
+        """Duration of the content [s on its own clock]."""
 
     @abstractmethod
     def frame_at(self, stamp: float) -> OperatorFrame:
-        """Frame at `stamp` [s] of the device's own clock; beyond the ends the outermost one."""
+        """Frame at `stamp` [s] of the device's own clock; the outermost ones are held."""
 
     def start(self, time: float) -> None:
-        """Play from the beginning, at `time` [s] of the robot's clock."""
+        """Start playing, at `time` [s] of the robot's clock."""
         self._started_at = time
 
     def elapsed(self, time: float) -> float:
@@ -54,22 +54,22 @@ class Player(Device):
         return self.frame_at(self.elapsed(time))
 
     def is_finished(self, time: float) -> bool:
-        """Whether it has played out and the last frame was held for `hold_s`."""
+        """Whether it has ended and the last frame was held for `hold_s`."""
         if self._started_at is None:
             return False
         played = time - self._started_at - self.duration / self.config.speed
-        # Lock-step clocks add up rounding; a nanosecond must not cost a tick.
+        # Sums of lock-step periods round; a nanosecond of tolerance saves a tick.
         return played >= self.config.hold_s - 1e-9
 
 
 class ReplayDevice(Player):
-    """Plays a recording from the moment of engaging, then holds its last frame.
+    """Plays a recording from engagement on, then holds its last frame.
 
     Args:
-        config: Its settings; `path` is required.
+        config: Device settings; `path` is required.
 
     Raises:
-        BadValue: If there is no path.
+        BadValue: If `path` is missing.
     """
 
     def __init__(self, config: DeviceConfig) -> None:
@@ -82,7 +82,7 @@ class ReplayDevice(Player):
         self._recording: Recording | None = None
 
     def connect(self) -> None:
-        """Read and check the whole recording.
+        """Read and validate the whole recording.
 
         Raises:
             BadRecording: If it is missing or malformed; names the file and the fault.
@@ -95,7 +95,7 @@ class ReplayDevice(Player):
 
     @property
     def recording(self) -> Recording:
-        """What is played.
+        """The recording.
 
         Raises:
             NotConnected: Before `connect()`.

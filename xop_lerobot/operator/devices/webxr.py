@@ -1,4 +1,4 @@
-"""Any headset whose browser knows WebXR; it opens a page that is served from here."""
+"""Device for any headset whose browser supports WebXR; it opens a page served from here."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ from xop_lerobot.operator.webxr.server import HeadsetServer
 LOOPBACK = "127.0.0.1"
 BACKLOG = 16
 FUTURE_S = 0.05
-"""Clocks drift apart by less than that from ping to ping [s]."""
+"""Largest clock drift between two pings [s]."""
 
 
 class PortTaken(XopError):
-    """The port cannot be opened; the message gives the reason and the flag that changes it."""
+    """The port cannot be opened; the message gives the reason and the flag to change it."""
 
 
 class WebXrDevice(LiveDevice):
-    """A headset, or a stand-in, that opens our page and streams head and hands.
+    """A headset, or a stand-in, that opens the page and streams head and hands.
 
     Args:
-        config: Its settings.
+        config: Device settings.
 
     Raises:
-        BadValue: If the code is too short, or TLS is off where others could listen.
+        BadValue: If the code is too short, or TLS is off while other machines can connect.
     """
 
     def __init__(self, config: DeviceConfig, clock: Callable[[], float] = time.monotonic) -> None:
@@ -84,11 +84,11 @@ class WebXrDevice(LiveDevice):
         return make_url("https" if self.tls else "http", list_hosts(self.host)[0], self.port)
 
     def connect(self) -> None:
-        """Listen, and return at once: the person may put the headset on later.
+        """Start listening, and return at once: the person may put the headset on later.
 
         Raises:
-            PortTaken: If the port cannot be listened at.
-            CertificateFault: If there is no certificate, and none can be made.
+            PortTaken: If the port cannot be opened.
+            CertificateFault: If there is no certificate, and none can be created.
         """
         if self._thread is not None:
             return
@@ -112,29 +112,29 @@ class WebXrDevice(LiveDevice):
             self._listener = None
 
     def introduce(self, robot: str, gestures: Mapping[str, str]) -> None:
-        """Say what a page tells who comes in.
+        """Set what the page shows to a new client.
 
         Args:
             robot: Name of the robot.
-            gestures: What the operator can ask for, and how, by name.
+            gestures: Explanation of each gesture, by its effect.
         """
         self.introduction = (robot, dict(gestures))
 
-    # -- the control loop's side -----------------------------------------------------------
+    # Called by the control loop.
 
     def read(self, time: float) -> OperatorFrame | None:
-        """Return the newest frame, or one in which nothing is tracked if it is too old."""
+        """Return the latest frame, or one with nothing tracked if it is too old."""
         self._read = super().read(time)
         return self._read
 
     def show(self, display: Display) -> None:
-        """Show this on every page; returns at once."""
+        """Update the display of every page; returns at once."""
         self._display = display
         if display.pictures:
             self._pictures.give(display.pictures)
 
     def take_requests(self) -> tuple[RecordingRequest, ...]:
-        """What was asked for on the page since the last call."""
+        """Return the requests made on the page since the last call."""
         return tuple(self._requests.popleft() for _ in range(len(self._requests)))
 
     @property
@@ -146,7 +146,7 @@ class WebXrDevice(LiveDevice):
             delay, trouble = self._delay.measure(now), self._delay.describe(now)
         return dataclasses.replace(status, delay=delay, trouble=status.trouble or trouble)
 
-    # -- the server's side -----------------------------------------------------------------
+    # Called on the server's thread.
 
     def stream(self) -> None:
         """Serve until interrupted."""
@@ -173,18 +173,18 @@ class WebXrDevice(LiveDevice):
                 self._loop.call_soon_threadsafe(self._loop_stop.set)
 
     def end_silence(self) -> None:
-        """Report the silence; the page stays connected and may continue."""
+        """Report the silence; the page stays connected and may resume."""
         self._say(f"{self.address}: nothing has come for {SILENT_S:g} s")
 
     def take(self, message: FrameMessage, client: Client) -> None:
-        """Take a frame of the operator, unless it is late."""
+        """Process a frame of the operator, unless it is late."""
         now = self.clock()
         measured = client.measure_delay(message, now)
         if measured is None:
             self.refuse("clock_unknown")
             return
         delay, error = measured
-        if delay < -error - FUTURE_S:  # nothing after it would count as new
+        if delay < -error - FUTURE_S:  # accepting it would make later frames look old
             self.refuse("from_the_future")
             return
         if not self._connected:
@@ -207,7 +207,7 @@ class WebXrDevice(LiveDevice):
         self._requests.append(request)
 
     def write_shown(self, role: str) -> list[str]:
-        """Messages with the present display."""
+        """Return the messages with the present display."""
         display, frame = self._display, self._read
         if display is None:
             return []
@@ -219,15 +219,15 @@ class WebXrDevice(LiveDevice):
         return shown
 
     def take_picture(self) -> Picture | None:
-        """The newest picture."""
+        """Return the latest images."""
         return self._pictures.newest
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Listen at `host` and `port`.
+    """Open a listening socket at `host` and `port`.
 
     Raises:
-        PortTaken: If that is not possible.
+        PortTaken: If that fails.
     """
     try:
         return socket.create_server(

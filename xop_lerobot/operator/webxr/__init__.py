@@ -1,1 +1,1 @@
-"""Any headset whose browser knows WebXR: a page and a WebSocket, served from here."""
+"""WebXR headsets: a page and a WebSocket, served from here."""

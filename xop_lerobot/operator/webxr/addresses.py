@@ -1,4 +1,4 @@
-"""Names and addresses of this machine."""
+"""Names and addresses of this machine, and the instructions to open the page."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import segno
 
 LOOPBACKS = ("127.0.0.1", "::1")
 ANY = ("0.0.0.0", "::")
-"""Listening there is listening at every address."""
+"""Wildcard addresses: listening there is listening at every address."""
 OUTSIDE = "192.0.2.1:9"
-"""Reserved for documentation: nobody is there, but the way to it begins in the usual network."""
+"""Address reserved for documentation, used only to look up the default route."""
 
 
 def list_addresses() -> list[str]:
-    """Addresses of this machine in its networks, that of the default route first.
+    """List this machine's network addresses, that of the default route first.
 
-    Addresses that hold for one cable alone (link-local) and loopback are left out.
+    Link-local and loopback addresses are left out.
     """
     found = set()
     for entries in psutil.net_if_addrs().values():
@@ -34,7 +34,7 @@ def list_addresses() -> list[str]:
 
 
 def list_names() -> list[str]:
-    """Names of this machine: its own, the same as neighbours know it, and localhost."""
+    """Return names of this machine: its host name, its mDNS name, and localhost."""
     name = socket.gethostname().lower().partition(".")[0]
     own = [name, f"{name}.local"] if _is_name(name) else []
     return [*own, "localhost"]
@@ -45,7 +45,7 @@ def _is_name(name: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches `host`."""
+    """Whether `host` is reachable from this machine only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -53,27 +53,27 @@ def is_loopback(host: str) -> bool:
 
 
 def make_url(scheme: str, host: str, port: int, code: str = "") -> str:
-    """Address of a page."""
+    """Return the URL of a page."""
     shown = f"[{host}]" if ":" in host else host
     return f"{scheme}://{shown}:{port}/{f'?code={code}' if code else ''}"
 
 
 def find_own_address(target: str) -> str:
-    """Own IPv4 address on the route to `target` (host:port); nothing is sent."""
+    """Return the own IPv4 address on the route to `target` (host:port); nothing is sent."""
     host, _, port = target.rpartition(":")
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.connect((host, int(port)))
             return str(probe.getsockname()[0])
     except OSError:
-        return "0.0.0.0"  # the connection will fail too, and say why
+        return "0.0.0.0"  # the connection itself will fail with a better message
 
 
 MARGIN = "  "
 
 
 def list_hosts(host: str) -> list[str]:
-    """Names and addresses under which a server that listens at `host` is reached, best first."""
+    """List names and addresses at which a server listening at `host` is reached, best first."""
     if is_loopback(host):
         return ["localhost"]
     if host not in ANY:
@@ -83,7 +83,7 @@ def list_hosts(host: str) -> list[str]:
 
 
 def draw_qr(text: str) -> str:
-    """Draw a QR code in half blocks, as terminals show them."""
+    """Draw a QR code in half-block characters for a terminal."""
     drawing = io.StringIO()
     segno.make(text, error="l", micro=False).terminal(out=drawing, compact=True, border=2)
     return drawing.getvalue()
@@ -95,11 +95,11 @@ def write_invitation(
     """Write the instructions to open the page.
 
     Args:
-        host: Where the server listens.
+        host: Address the server listens at.
         port: Its port.
-        tls: Whether it speaks TLS.
+        tls: Whether it uses TLS.
         code: The pairing code.
-        fingerprint: That of the certificate.
+        fingerprint: Fingerprint of the certificate.
         qr: Whether to draw the first address as a QR code.
     """
     scheme = "https" if tls else "http"

@@ -1,7 +1,7 @@
-"""Certificate of this machine, made on first use.
+"""Self-signed TLS certificate of this machine, created on first use.
 
-It signs itself, is valid for the machine's own names and addresses alone, and never leaves the
-user's own folder but for its public half.
+It is valid for the machine's own names and addresses only; its private key never leaves the user's
+folder.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from xop_lerobot.operator.webxr.addresses import LOOPBACKS, list_addresses, list
 logger = logging.getLogger(__name__)
 
 VALID = datetime.timedelta(days=397)
-"""Apple's systems believe none that is valid for longer."""
+"""Longest validity that Apple's systems accept."""
 RENEW = datetime.timedelta(days=30)
-"""It is renewed so long before its end."""
+"""Remaining validity at which it is renewed."""
 SKEW = datetime.timedelta(hours=1)
-"""The clock of a headset may be so late."""
+"""Tolerated lag of a headset's clock."""
 MAX_NAMES = 64
 
 
 class CertificateFault(XopError):
-    """The certificate cannot be made or read; the message names the folder."""
+    """The certificate cannot be created or read; the message names the folder."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Certificate:
 
     Attributes:
         path: File of the certificate (PEM).
-        key_path: File of its private key (PEM), which its user alone can read.
-        names: Names and addresses that it is valid for.
-        end: When it ends.
-        fingerprint: SHA-256 of it, in pairs of digits, as browsers show it.
+        key_path: File of its private key (PEM), readable by its user only.
+        names: Names and addresses for which it is valid.
+        end: End of its validity.
+        fingerprint: Its SHA-256 as pairs of hexadecimal digits, as browsers show it.
     """
 
     path: Path
@@ -61,7 +61,7 @@ class Certificate:
     fingerprint: str
 
     def make_context(self) -> ssl.SSLContext:
-        """Make the context of a server."""
+        """Make the server's TLS context."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.load_cert_chain(self.path, self.key_path)
@@ -69,13 +69,13 @@ class Certificate:
 
 
 def find_folder() -> Path:
-    """The folder of the certificate."""
+    """Return the folder of the certificate."""
     base = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
     return Path(base) / "xop-lerobot"
 
 
 def list_own_names() -> frozenset[str]:
-    """All present names and addresses of this machine."""
+    """Return all present names and addresses of this machine."""
     return frozenset([*list_names(), *LOOPBACKS, *list_addresses()][:MAX_NAMES])
 
 
@@ -84,15 +84,15 @@ def get_certificate(
     names: Iterable[str] | None = None,
     now: datetime.datetime | None = None,
 ) -> Certificate:
-    """Return this machine's certificate; make one if none is valid.
+    """Return this machine's certificate; create one if none is valid.
 
-    A new one is made when a name or an address is not in it, when it ends within 30 days, when
-    it does not belong to its key, and when others could have read the key.
+    A new one is created when a name or address is missing in it, when it ends within 30 days, when
+    it does not match its key, and when others could have read the key.
 
     Args:
-        folder: Where it is kept; None for the user's own folder.
-        names: What it must be valid for; None for all that this machine is called.
-        now: The time; None for the present.
+        folder: Its folder; None for the user's own.
+        names: Names for which it must be valid; None for all of this machine.
+        now: Present time; None to read the clock.
 
     Raises:
         CertificateFault: If the folder cannot be used.
@@ -118,7 +118,7 @@ def get_certificate(
 def inspect_certificate(
     folder: Path, names: frozenset[str], now: datetime.datetime
 ) -> tuple[Certificate | None, str]:
-    """Return the certificate of a folder, or None and what is wrong with it; changes nothing."""
+    """Return the certificate of a folder, or None and its fault; changes nothing."""
     path, key_path = folder / "webxr.crt", folder / "webxr.key"
     if not (path.exists() and key_path.exists()):
         return None, "there is none yet"
@@ -177,8 +177,8 @@ def _sign(
         encipher_only=False,
         decipher_only=False,
     )
-    # Headsets of Apple let their wearer trust authorities alone, so it is one; its constraints
-    # keep it from vouching for anything but this machine.
+    # Apple's headsets let users trust certificate authorities only, so it is one; the name
+    # constraints restrict it to this machine.
     constraints = x509.NameConstraints(
         permitted_subtrees=[
             *map(x509.DNSName, hosts),
@@ -214,7 +214,7 @@ def _is_address(name: str) -> bool:
 
 
 def _replace(path: Path, data: bytes, mode: int) -> None:
-    """Write a file at once, which nobody else may read before it has its mode."""
+    """Replace a file atomically, never readable by others before it has its mode."""
     handle, name = tempfile.mkstemp(dir=path.parent)  # mode 0600
     try:
         with os.fdopen(handle, "wb") as file:
@@ -228,7 +228,7 @@ def _replace(path: Path, data: bytes, mode: int) -> None:
 
 @contextlib.contextmanager
 def _hold(folder: Path) -> Iterator[None]:
-    """Let one process at a time make a certificate."""
+    """Lock the folder, so that one process at a time creates a certificate."""
     with (folder / "webxr.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

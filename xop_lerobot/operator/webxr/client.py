@@ -1,4 +1,4 @@
-"""One connected page: its clock, and messages to it."""
+"""A connected page: its clock offset, and the messages sent to it."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from xop_lerobot.operator.webxr.pictures import Picture
 from xop_lerobot.operator.webxr.protocol import FrameMessage, Pong, write_ping
 
 WINDOW_S = 10.0
-"""Older answers are forgotten: two clocks drift apart [s]."""
+"""Time after which answers are discarded, since the clocks drift apart [s]."""
 MAX_OPEN = 32
-"""Pings that may wait for an answer."""
+"""Largest number of unanswered pings."""
 SLEPT_S = 0.05
-"""A contradiction of two answers that is larger means that the page's clock has jumped [s]."""
+"""Contradiction between two answers above which the page's clock must have jumped [s]."""
 
 
 class Answer(NamedTuple):
     """Result of one ping.
 
     Attributes:
-        time: When its answer came [s].
-        offset: The page's clock minus ours, if both ways took as long [s].
-        error: How far that may be off: half of the time for there and back [s].
+        time: Arrival of the answer [s].
+        offset: Page clock minus ours, assuming equal delays both ways [s].
+        error: Uncertainty of the offset: half of the round-trip time [s].
     """
 
     time: float
@@ -38,10 +38,10 @@ class Answer(NamedTuple):
 
 
 class ClockOffset:
-    r"""Offset of a page's clock: that of the fastest ping of the last 10 s.
+    r"""Offset of a page's clock, by the fastest ping of the last 10 s.
 
-    A ping sent at :math:`s` and answered at :math:`c` of the page's clock, whose answer comes at
-    :math:`r`, says :math:`c - (s + r)/2 \pm (r - s)/2`.
+    A ping sent at :math:`s`, answered at :math:`c` of the page's clock and received at :math:`r`
+    gives the offset :math:`c - (s + r)/2 \pm (r - s)/2`.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class ClockOffset:
         self._number = 0
 
     def ping(self, time: float) -> int:
-        """Note a ping that is sent at `time` [s]; return its number."""
+        """Register a ping sent at `time` [s]; return its number."""
         self._number += 1
         self._open[self._number] = time
         while len(self._open) > MAX_OPEN:
@@ -58,12 +58,12 @@ class ClockOffset:
         return self._number
 
     def pong(self, number: int, page_time: float, time: float) -> bool:
-        """Take an answer.
+        """Process an answer.
 
         Args:
-            number: That of the ping.
-            page_time: When it was answered, on the page's clock [s].
-            time: When the answer came [s].
+            number: Number of the ping.
+            page_time: Time of the answer on the page's clock [s].
+            time: Arrival of the answer [s].
 
         Returns:
             Whether there was such a ping.
@@ -82,30 +82,30 @@ class ClockOffset:
 
     @property
     def best(self) -> Answer | None:
-        """The most exact answer, None before the first."""
+        """Most exact answer, None before the first."""
         return min(self._answers, key=lambda answer: answer.error, default=None)
 
 
 logger = logging.getLogger(__name__)
 
 SEND_S = 0.05
-"""Period of what is shown [s]."""
+"""Period of sending the display [s]."""
 PING_S = 0.5
 """Period of pings [s]."""
 MAX_ON_THE_WAY = 2
-"""Pictures that may be on their way; each is followed by a ping, whose answer says it is there."""
+"""Largest number of image sets in flight; each is followed by a ping whose answer confirms it."""
 UNSENT = 16 * 1024
-"""What the system may hold back for a slow client before it counts as slow [bytes]."""
+"""Size of the system's send buffer above which a client counts as slow [bytes]."""
 
 
 class Client:
-    """A page.
+    """A connected page.
 
     Args:
         ws: Its WebSocket.
-        request: What it was opened with.
+        request: Request that opened it.
         role: `operator` or `monitor`.
-        clock: Our clock [s].
+        clock: Clock of the server [s].
     """
 
     def __init__(
@@ -118,30 +118,30 @@ class Client:
         self.ws, self.role, self._clock = ws, role, clock
         self.rate = RateLimit()
         self.active_at = clock()
-        """When it came in or sent its last frame [s]."""
+        """Time of connecting, or of its last frame [s]."""
         self._offset = ClockOffset()
         self._transport = request.transport
         self._shown: list[str] = []
         self._picture: Picture | None = None
-        self._on_the_way: list[int] = []  # the pings behind them
+        self._on_the_way: list[int] = []  # pings that follow image sets in flight
         _limit_buffer(self._transport)
 
     def abort(self) -> None:
-        """Close the connection without a farewell."""
+        """Close the connection without a message."""
         if self._transport is not None:
             self._transport.abort()
 
     def take_pong(self, pong: Pong) -> None:
-        """Take the answer to a ping; others are ignored."""
+        """Process the answer to a ping; unknown ones are ignored."""
         self._offset.pong(pong.number, pong.sent, self._clock())
         self._on_the_way = [number for number in self._on_the_way if number > pong.number]
 
     def measure_delay(self, message: FrameMessage, time: float) -> tuple[float, float] | None:
-        """Delay of a frame that arrives at `time` [s].
+        """Measure the delay of a frame that arrives at `time` [s].
 
         Returns:
-            Delay, below 0 for frames of the future, and how far it may be off [s]; None while no
-            ping was answered.
+            Delay, negative for frames from the future, and its uncertainty [s]; None before the
+            first answered ping.
         """
         best = self._offset.best
         return None if best is None else (time - (message.sent - best.offset), best.error)
@@ -151,7 +151,7 @@ class Client:
         write_shown: Callable[[str], list[str]],
         take_picture: Callable[[], Picture | None],
     ) -> None:
-        """Send what is shown, the newest picture and pings until the connection ends."""
+        """Send the display, the latest images and pings until the connection ends."""
         next_ping = 0.0
         loop = asyncio.get_running_loop()
         while not self.ws.closed:
@@ -179,7 +179,7 @@ class Client:
             if text not in self._shown:
                 await self.ws.send_str(text)
         self._shown = shown
-        # Who still has something to receive gets no picture: it would be old on its arrival.
+        # A client with data still in flight gets no images: they would be old on arrival.
         if picture is None or picture is self._picture or not self._is_idle():
             return
         self._picture = picture

@@ -1,4 +1,4 @@
-"""Delay of a headset's frames, and its warnings."""
+"""Measures the delay of a headset's frames, and warns of it."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import statistics
 from collections import deque
 
 WINDOW_S = 1.0
-"""Time over which the delay is taken [s]."""
+"""Time window of the delay [s]."""
 MAX_FRAMES = 400
-"""The newest that are kept of them, however many there are."""
+"""Largest number of frames kept in the window."""
 SLOW_S = 0.15
-"""Who drives with a delay of more than this feels it [s]."""
+"""Delay above which an operator notices it [s]."""
 GROWN_S = 0.08
-"""So much over the smallest delay of the connection, it has grown [s]."""
+"""Increase over the connection's smallest delay that is reported [s]."""
 
 
 class DelayMeter:
-    """The delay of the last second.
+    """Measures the delay over the last second.
 
     Args:
-        limit: Frames that are older on arrival are dropped [s].
+        limit: Delay above which frames are dropped on arrival [s].
     """
 
     def __init__(self, limit: float) -> None:
@@ -33,15 +33,15 @@ class DelayMeter:
         self._smallest = float("inf")
 
     def take(self, time: float, delay: float, error: float) -> bool:
-        """Take a frame.
+        """Record a frame.
 
         Args:
-            time: When it came [s].
-            delay: How old it was [s].
-            error: How far that may be off [s].
+            time: Time of arrival [s].
+            delay: Its age on arrival [s].
+            error: Uncertainty of the age [s].
 
         Returns:
-            Whether it is too late to be used, or may be.
+            Whether it is, or may be, too late to be used.
         """
         late = delay + error > self._limit
         self._frames.append((time, delay, late))
@@ -54,12 +54,12 @@ class DelayMeter:
             self._frames.popleft()
 
     def measure(self, time: float) -> float | None:
-        """Median of the delays in the second before `time` [s]; None without a frame."""
+        """Median delay in the second before `time` [s]; None without frames."""
         self._forget(time)
         return statistics.median(d for _, d, _ in self._frames) if self._frames else None
 
     def describe(self, time: float) -> str:
-        """Warning about the delay in words; empty if none."""
+        """Warning about the delay; empty if none."""
         delay = self.measure(time)
         if delay is None:
             return ""

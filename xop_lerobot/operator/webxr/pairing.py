@@ -1,4 +1,4 @@
-"""Access control: the code of a session, and limits on guessing it."""
+"""Access control: pairing code, and limits on guesses, messages and connections."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from aiohttp import web
 from xop_lerobot.core.errors import BadValue
 
 ALPHABET = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
-"""No letter looks like a digit."""
+"""Letters and digits that cannot be confused."""
 LENGTH = 8
 MIN_LENGTH = 6
 MAX_WRONG = 5
-"""Wrong codes from one address until it is blocked."""
+"""Number of wrong codes from one address before it is blocked."""
 BLOCK_S = 60.0
-"""For how long [s]."""
+"""Duration of the block [s]."""
 MAX_ADDRESSES = 256
-"""Addresses that are remembered; the oldest are forgotten."""
+"""Number of remembered addresses; the oldest are forgotten."""
 MAX_RATE = 400
-"""Messages that one client may send in a second."""
+"""Largest number of messages per second from one client."""
 
 
 @functools.cache
 def make_code() -> str:
-    """The code of this process, 40 random bits; the next process has another."""
+    """Return this process's code of 40 random bits; every process has another."""
     return "".join(secrets.choice(ALPHABET) for _ in range(LENGTH))
 
 
 def check_code(code: str) -> None:
-    """Check a code chosen by the user.
+    """Validate a code chosen by the user.
 
     Raises:
-        BadValue: If it is short, or cannot stand in an address.
+        BadValue: If it is too short, or cannot be part of a URL.
     """
     if len(code) < MIN_LENGTH or not (code.isascii() and code.isalnum()):
         raise BadValue(
@@ -46,19 +46,19 @@ def check_code(code: str) -> None:
         )
 
 
-class Door:
-    """Compares codes, and blocks addresses that send too many wrong ones.
+class CodeCheck:
+    """Checks codes, and blocks addresses that send too many wrong ones.
 
     Args:
-        code: The right one.
+        code: The right code.
     """
 
     def __init__(self, code: str) -> None:
         self._code = code.encode()
-        self._wrong: OrderedDict[str, tuple[int, float]] = OrderedDict()  # how many, when last
+        self._wrong: OrderedDict[str, tuple[int, float]] = OrderedDict()  # count, time of the last
 
     def refuse(self, address: str, code: str, time: float) -> str | None:
-        """Reason to refuse a client from `address` at `time` [s], None if it is admitted."""
+        """Return why a client from `address` is refused at `time` [s], None if it is admitted."""
         count, last = self._wrong.get(address, (0, time))
         wait = last + BLOCK_S - time
         if wait <= 0:
@@ -76,13 +76,13 @@ class Door:
 
 
 class RateLimit:
-    """Whether a client sends more than `MAX_RATE` messages in a second."""
+    """Detects clients that send more than `MAX_RATE` messages per second."""
 
     def __init__(self) -> None:
         self._times: deque[float] = deque()
 
     def is_broken(self, time: float) -> bool:
-        """Count a message at `time` [s]."""
+        """Count a message at `time` [s]; return whether the limit is exceeded."""
         self._times.append(time)
         while self._times[0] <= time - 1.0:
             self._times.popleft()
@@ -91,19 +91,19 @@ class RateLimit:
 
 MAX_CONNECTIONS = 64
 FIRST_REQUEST_S = 10.0
-"""A connection over which nothing is asked for so long is ended [s]."""
+"""Time without a request after which a connection is closed [s]."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class Connections:
-    """Accepts connections, and ends idle ones.
+    """Limits the number of connections, and closes idle ones.
 
-    Only those that are there, or may still arrive, are remembered: however many come and go, it
-    is never more than `MAX_CONNECTIONS` of each.
+    Only open connections, and those that may still complete, are remembered: never more than
+    `MAX_CONNECTIONS` of each, however many come and go.
 
     Args:
-        arrival_s: How long a connection may take until it can be used, as for TLS [s].
+        arrival_s: Time a connection may take until it is usable, as for TLS [s].
     """
 
     def __init__(self, arrival_s: float) -> None:
@@ -131,7 +131,7 @@ class Connections:
             self._arrivals.popleft()
 
     async def watch(self, server: web.Server) -> None:
-        """End connections over which nothing is asked, until this is cancelled."""
+        """Close connections without a request, until cancelled."""
         while True:
             await asyncio.sleep(min(1.0, FIRST_REQUEST_S))
             now = asyncio.get_running_loop().time()
@@ -147,13 +147,13 @@ class Connections:
 
     @web.middleware
     async def note_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Take note that something is asked over a connection."""
+        """Middleware that marks a connection as used."""
         self._asked.add(request.protocol)
         return await handler(request)
 
 
 class _Refusal(asyncio.Protocol):
-    """Closes a connection beyond the limit."""
+    """Protocol that closes a connection beyond the limit."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         transport.close()

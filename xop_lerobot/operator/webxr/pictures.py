@@ -1,4 +1,4 @@
-"""Camera images as JPEG, encoded on a separate thread; the newest wins."""
+"""Camera images as JPEG, encoded on a separate thread; only the latest are encoded."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ logger = logging.getLogger(__name__)
 
 QUALITY = 70
 MAX_SIDE = 1280
-"""Larger pictures are made smaller before they are sent [pixels]."""
+"""Longest side of a transmitted image; larger images are scaled down [px]."""
 MAX_CAMERAS = 4
 FIRST = "head"
-"""The camera that comes first."""
+"""Camera shown first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,18 +26,18 @@ class Picture:
     """Images of all cameras at one instant.
 
     Attributes:
-        messages: A message for each camera: its number in one byte, then the JPEG.
+        messages: A message per camera: its index in one byte, then the JPEG.
     """
 
     messages: tuple[bytes, ...]
 
 
 class PictureEncoder:
-    """Encodes the newest images; older ones are skipped."""
+    """Encodes the latest images; older ones are skipped."""
 
     def __init__(self) -> None:
         self.newest: Picture | None = None
-        """The last that was encoded."""
+        """Latest encoded images."""
         self._given: Mapping[str, np.ndarray] | None = None
         self._wake = threading.Condition()
         self._running = False
@@ -50,7 +50,7 @@ class PictureEncoder:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread; may be called twice."""
+        """Stop the thread; may be called twice."""
         with self._wake:
             self._running = False
             self._wake.notify()
@@ -59,7 +59,7 @@ class PictureEncoder:
             self._thread = None
 
     def give(self, pictures: Mapping[str, np.ndarray]) -> None:
-        """Take pictures, by camera, that nobody changes any more; returns at once."""
+        """Provide images by camera, which must not be modified afterwards; returns at once."""
         with self._wake:
             self._given = pictures
             self._wake.notify()
@@ -78,10 +78,10 @@ class PictureEncoder:
 
 
 def encode(pictures: Mapping[str, np.ndarray]) -> Picture:
-    """Encode the images of the cameras, the head's first.
+    """Encode the images of the cameras, the head camera first.
 
     Args:
-        pictures: By camera. Shapes (height, width, 3), uint8.
+        pictures: Images by camera. Shapes (height, width, 3), uint8.
     """
     names = sorted(pictures, key=lambda name: (name != FIRST, name))[:MAX_CAMERAS]
     messages = []

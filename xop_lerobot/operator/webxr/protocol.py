@@ -27,16 +27,16 @@ PORT = 8012
 MAX_MESSAGE = 8192
 """Longest message of a page [bytes]."""
 MAX_REASON = 200
-"""Longest reason for a farewell that is passed on [characters]."""
+"""Longest forwarded reason of a `bye` [characters]."""
 SOURCES = ("hands", "controllers", "standin")
 GRIP_TO_WRIST = 0.08
-"""From the middle of a fist around a controller back to the wrist [m]."""
+"""Distance from the middle of a fist around a controller back to the wrist [m]."""
 
-# Our axes in those of a joint, as columns. Heads and wrists of WebXR lie as its world does when
-# ours do: x right, y up or out of the back of the hand, z back or away from the fingers.
+# Columns: our axes in the frame of a joint. WebXR heads and wrists are parallel to its world when
+# ours are: x right, y up or out of the back of the hand, z back or away from the fingers.
 PARALLEL = WORLD.T
-# A grip has z from the thumb along the rod that is held, x out of the back of a right hand and
-# into that of a left one, and y towards the forearm.
+# A grip frame has z from the thumb along the held rod, x out of the back of a right hand and into
+# that of a left one, and y towards the forearm.
 GRIPS = {
     "left": np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]),
     "right": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
@@ -52,10 +52,10 @@ class FrameMessage:
     """Head and hands of the operator.
 
     Attributes:
-        number: Counts up, one page's frames.
-        sent: When it was sent, on the page's clock [s].
-        source: What it was made from, one of `SOURCES`, but for a hand that names its own.
-        frame: The same in our convention, at time 0; what is malformed is NaN.
+        number: Frame counter of the page.
+        sent: Send time on the page's clock [s].
+        source: Input source, one of `SOURCES`, except for a hand that states its own.
+        frame: The frame in our convention, at time 0; malformed values are NaN.
     """
 
     number: int
@@ -69,8 +69,8 @@ class Pong:
     """Answer to a ping.
 
     Attributes:
-        number: That of the ping.
-        sent: When it was answered, on the page's clock [s].
+        number: Number of the ping.
+        sent: Time of the answer on the page's clock [s].
     """
 
     number: int
@@ -79,10 +79,10 @@ class Pong:
 
 @dataclass(frozen=True)
 class Bye:
-    """The operator has ended the session, or has taken the headset off.
+    """The operator has ended the session, or taken off the headset.
 
     Attributes:
-        reason: Why, in words.
+        reason: The reason, as text.
     """
 
     reason: str
@@ -92,10 +92,10 @@ Message = FrameMessage | Pong | RecordingRequest | Bye
 
 
 def parse_message(text: str) -> Message | str:
-    """Decode a page's message.
+    """Decode a message of a page.
 
     Returns:
-        The message; or why it is none, in one word.
+        The message; or why it is invalid, in one word.
     """
     try:
         values = json.loads(text)
@@ -127,7 +127,7 @@ def _parse_bye(values: Mapping[str, Any]) -> Bye:
 
 
 def clean(text: str) -> str:
-    """`text` for a log: one line, printable, shortened."""
+    """Return `text` for a log: one line, printable, truncated."""
     return "".join(c if c.isprintable() else " " for c in text[:MAX_REASON]).strip()
 
 
@@ -144,7 +144,7 @@ def _parse_frame(values: Mapping[str, Any]) -> FrameMessage | str:
     for i, side in enumerate(("left", "right")):
         hand = values.get(side)
         wrist = _NOWHERE
-        # A guessed position is no position.
+        # WebXR marks guessed positions as emulated; they do not count as tracked.
         if hand is not None and not (isinstance(hand, dict) and hand.get("emulated") is True):
             wrist, pinch[i] = _read_hand(hand, source, side)
             tracked[1 + i] = True
@@ -163,7 +163,7 @@ _PARSERS: dict[str, Callable[[Mapping[str, Any]], Message | str]] = {
 
 
 def _read_hand(hand: Any, source: str, side: str) -> tuple[np.ndarray, float]:
-    """Pose of a wrist, shape (7,), and distance of thumb and index tip [m]; NaN where bad."""
+    """Pose of a wrist, shape (7,), and distance of thumb and index tip [m]; NaN if malformed."""
     if not isinstance(hand, dict):
         return _NOWHERE, math.nan
     source = hand.get("source", source)
@@ -172,7 +172,7 @@ def _read_hand(hand: Any, source: str, side: str) -> tuple[np.ndarray, float]:
     if source == "controllers":
         grip = _read_numbers(hand.get("grip"), 7)
         pose = _to_ours(grip, _GRIP_QUATS[side])
-        # Only finite poses are turned: the rest is left for the guard to count.
+        # Leave non-finite poses as they are: the stream guard counts them.
         if np.isfinite(pose).all():
             pose[:3] -= quat_rotate(pose[3:], np.array([GRIP_TO_WRIST, 0, 0]))
         trigger = _read_number(hand.get("trigger"))
@@ -185,17 +185,17 @@ def _read_hand(hand: Any, source: str, side: str) -> tuple[np.ndarray, float]:
 
 
 def _to_ours(theirs: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Pose of ours for x y z qx qy qz qw of WebXR, and our axes in its own, wxyz. Shape (7,)."""
+    """Convert a WebXR pose x y z qx qy qz qw, given our axes in its frame as wxyz. Shape (7,)."""
     position, quat = WORLD @ theirs[:3], theirs[[6, 3, 4, 5]]
     norm = math.hypot(*quat)
     if not abs(norm - 1) <= NORM_TOLERANCE:
-        return make_pose(position, quat)  # no rotation, as the guard will say
+        return make_pose(position, quat)  # not a rotation: left for the stream guard to reject
     turned = quat_multiply(quat_multiply(_WORLD_QUAT, quat / norm), axes)
     return make_pose(position, turned)
 
 
 def _read_number(value: Any) -> float:
-    """The finite number `value`, NaN if it is none."""
+    """Return `value` as a finite number, NaN if it is not one."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
     try:
@@ -206,7 +206,7 @@ def _read_number(value: Any) -> float:
 
 
 def _read_numbers(values: Any, count: int) -> np.ndarray:
-    """A list of `count` numbers, NaN where it is something else. Shape (count,)."""
+    """Return a list of `count` numbers, NaN where malformed. Shape (count,)."""
     if not isinstance(values, list) or len(values) != count:
         return np.full(count, np.nan)
     return np.array([_read_number(value) for value in values])
@@ -232,7 +232,7 @@ def write_welcome(role: str, robot: str, gestures: Mapping[str, str]) -> str:
 
 
 def write_ping(number: int, time: float) -> str:
-    """Write a ping of `time` [s] on the server's clock."""
+    """Write a ping sent at `time` [s] of the server's clock."""
     return json.dumps({"type": "ping", "id": number, "t": round(time * 1e3, 3)})
 
 
@@ -248,14 +248,14 @@ def write_display(
     rate: float,
     delay: float | None,
 ) -> str:
-    """Write what is shown.
+    """Write the content of the display.
 
     Args:
-        display: What the teleoperation says.
-        warnings: All warnings, its own among them.
-        tracked: Whether head, left and right wrist are seen. Shape (3,), bool.
+        display: Display of the teleoperation.
+        warnings: All warnings, including the display's.
+        tracked: Whether head, left and right wrist are tracked. Shape (3,), bool.
         rate: Frames in the last second [Hz].
-        delay: Delay of the frames [s], None while it is not known.
+        delay: Delay of the frames [s], None if unknown.
     """
     progress = display.progress
     return json.dumps(
@@ -281,7 +281,7 @@ def write_display(
 
 
 def write_pose(frame: OperatorFrame) -> str:
-    """Write head and wrists for monitors: x y z qw qx qy qz, null where not tracked."""
+    """Write head and wrists for monitors: x y z qw qx qy qz, null if not tracked."""
     names = ("head", "left_wrist", "right_wrist")
     poses = [
         [round(float(x), 4) for x in frame.pose(name)] if seen else None

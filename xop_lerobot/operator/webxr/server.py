@@ -1,4 +1,4 @@
-"""Server of a WebXR headset: page, certificate and WebSocket on one port."""
+"""Server for WebXR headsets: page, certificate and WebSocket on one port."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from xop_lerobot.core.paced_log import PacedLog
 from xop_lerobot.operator.display import RecordingRequest
 from xop_lerobot.operator.webxr.certificate import Certificate
 from xop_lerobot.operator.webxr.client import Client
-from xop_lerobot.operator.webxr.pairing import Connections, Door, Handler
+from xop_lerobot.operator.webxr.pairing import CodeCheck, Connections, Handler
 from xop_lerobot.operator.webxr.pictures import Picture
 from xop_lerobot.operator.webxr.protocol import (
     MAX_MESSAGE,
@@ -33,15 +33,15 @@ logger = logging.getLogger(__name__)
 PAGE = Path(__file__).parent / "page"
 MAX_MONITORS = 4
 IDLE_S = 5.0
-"""An operator that sends no frame for so long makes room for the next [s]."""
+"""Time without a frame after which an operator may be replaced by another [s]."""
 HEARTBEAT_S = 3.0
-"""Clients that answer nothing for so long are let go [s]."""
+"""Time without an answer after which clients are disconnected [s]."""
 CLOSE_S = 2.0
-"""How long a farewell may take [s]."""
+"""Longest time to close a connection [s]."""
 HANDSHAKE_S = 3.0
-"""How long TLS may take [s]."""
+"""Longest time of a TLS handshake [s]."""
 ARRIVAL_S = 0.5
-"""How long a connection without TLS may take to be there [s]."""
+"""Longest time of a connection without TLS to become usable [s]."""
 DRIVES = "somebody drives already; wait until they have left, or open the page as a monitor"
 HEADERS = {
     "Cache-Control": "no-store",
@@ -61,8 +61,8 @@ _KINDS = {
 }
 
 
-class Wearer(Protocol):
-    """What the server serves: a `WebXrDevice`. All of it is called on the server's thread."""
+class ServedDevice(Protocol):
+    """Interface of the served device, a `WebXrDevice`; called on the server's thread."""
 
     def clock(self) -> float:
         """Time [s]."""
@@ -70,15 +70,15 @@ class Wearer(Protocol):
 
     @property
     def introduction(self) -> tuple[str, dict[str, str]]:
-        """The robot's name, and what the gestures do, by name."""
+        """The robot's name, and the explanation of each gesture by its effect."""
         ...
 
     def take(self, message: FrameMessage, client: Client) -> None:
-        """Take a frame of the operator."""
+        """Process a frame of the operator."""
         ...
 
     def refuse(self, reason: str) -> None:
-        """Count a message that holds no frame."""
+        """Count a message without a usable frame."""
         ...
 
     def request(self, request: RecordingRequest) -> None:
@@ -86,34 +86,34 @@ class Wearer(Protocol):
         ...
 
     def leave(self, reason: str) -> None:
-        """Take note that the operator is gone."""
+        """Note that the operator has left."""
         ...
 
     def write_shown(self, role: str) -> list[str]:
-        """Messages with the present display."""
+        """Return the messages with the present display."""
         ...
 
     def take_picture(self) -> Picture | None:
-        """The newest picture."""
+        """Return the latest images."""
         ...
 
 
 class HeadsetServer:
-    """Serves one operator and a few monitors until it is told to stop.
+    """Serves one operator and a few monitors.
 
     Args:
-        wearer: Whom it serves.
+        device: The served device.
         code: The pairing code.
-        certificate: That of this machine, None without TLS.
+        certificate: Certificate of this machine, None without TLS.
     """
 
     def __init__(
         self,
-        wearer: Wearer,
+        device: ServedDevice,
         code: str,
         certificate: Certificate | None = None,
     ) -> None:
-        self._wearer, self._door = wearer, Door(code)
+        self._device, self._codes = device, CodeCheck(code)
         self._certificate = certificate
         self._operator: Client | None = None
         self._clients: set[Client] = set()
@@ -123,7 +123,7 @@ class HeadsetServer:
         self._log = PacedLog(logger)
 
     async def run(self, listener: socket.socket, stop: asyncio.Event) -> None:
-        """Serve at `listener`, which is closed in the end, until `stop` is set."""
+        """Serve at `listener` until `stop` is set, then close it."""
         app = web.Application(
             client_max_size=1, middlewares=[self._connections.note_request, _add_headers]
         )
@@ -164,7 +164,7 @@ class HeadsetServer:
     async def _send_page(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info.get("name", "index.html")
         path = PAGE / name
-        # Only files that lie in the folder itself: the name has no slash, and is no other way out.
+        # Only files directly in the folder: no path can lead out of it.
         if path.parent != PAGE or path.suffix not in _KINDS or not path.is_file():
             raise web.HTTPNotFound
         return web.Response(body=path.read_bytes(), content_type=_KINDS[path.suffix])
@@ -189,10 +189,10 @@ class HeadsetServer:
         )
         try:
             await ws.prepare(request)
-        except ValueError:  # headers that are no text
+        except ValueError:  # malformed headers
             raise web.HTTPBadRequest from None
-        client = Client(ws, request, role, self._wearer.clock)
-        reason = self._door.refuse(address, request.query.get("code", ""), self._wearer.clock())
+        client = Client(ws, request, role, self._device.clock)
+        reason = self._codes.refuse(address, request.query.get("code", ""), self._device.clock())
         if reason is not None:
             self._log.warning("WebXR: %s was refused: %s.", address, reason)
         else:
@@ -207,10 +207,10 @@ class HeadsetServer:
             address,
         )
         sender = asyncio.create_task(
-            client.send_on(self._wearer.write_shown, self._wearer.take_picture)
+            client.send_on(self._device.write_shown, self._device.take_picture)
         )
         try:
-            await ws.send_str(write_welcome(role, *self._wearer.introduction))
+            await ws.send_str(write_welcome(role, *self._device.introduction))
             await self._listen(client)
         except (ConnectionError, asyncio.CancelledError):
             pass
@@ -221,7 +221,7 @@ class HeadsetServer:
         return ws
 
     async def _find_no_room(self, client: Client) -> str | None:
-        """Why there is no room for `client`, None if there is; it has it then."""
+        """Return why `client` is refused, None if it is admitted."""
         if client.role == "monitor":
             monitors = sum(other.role == "monitor" for other in self._clients)
             return (
@@ -230,7 +230,7 @@ class HeadsetServer:
         if client.role != "operator":
             return "role must be operator or monitor"
         other = self._operator
-        if other is not None and self._wearer.clock() - other.active_at <= IDLE_S:
+        if other is not None and self._device.clock() - other.active_at <= IDLE_S:
             return DRIVES
         if other is not None:
             self._forget(other, "somebody has taken over")
@@ -241,7 +241,7 @@ class HeadsetServer:
         return None
 
     async def _listen(self, client: Client) -> None:
-        """Take what `client` sends until it leaves or does what it may not."""
+        """Process the messages of `client` until it leaves or breaks a rule."""
         async for message in client.ws:
             if message.type is not WSMsgType.TEXT:
                 reason: str | None = "only text messages are accepted"
@@ -257,27 +257,27 @@ class HeadsetServer:
         if client.rate.is_broken(asyncio.get_running_loop().time()):
             return "too many messages"
         if len(text.encode()) > MAX_MESSAGE:
-            self._wearer.refuse("too_long")
+            self._device.refuse("too_long")
             return f"a message may have {MAX_MESSAGE} bytes"
         message = parse_message(text)
         if isinstance(message, Pong):
             client.take_pong(message)
             return None
-        if isinstance(message, RecordingRequest):  # of whoever stands by, too
-            self._wearer.request(message)
+        if isinstance(message, RecordingRequest):  # monitors may also make requests
+            self._device.request(message)
         elif client is not self._operator:
             return "monitors look on"
         elif isinstance(message, str):
-            self._wearer.refuse(message)
+            self._device.refuse(message)
         elif isinstance(message, FrameMessage):
-            client.active_at = self._wearer.clock()
-            self._wearer.take(message, client)
+            client.active_at = self._device.clock()
+            self._device.take(message, client)
         elif isinstance(message, Bye):
-            self._wearer.leave(message.reason or "the session in the headset has ended")
+            self._device.leave(message.reason or "the session in the headset has ended")
         return None
 
     async def _dismiss(self, client: Client, reason: str) -> None:
-        """Tell a client why, and close its connection."""
+        """Tell a client the reason, and close its connection."""
         self._forget(client, reason)
         try:
             async with asyncio.timeout(CLOSE_S):
@@ -289,11 +289,11 @@ class HeadsetServer:
     def _forget(self, client: Client, reason: str) -> None:
         if client is self._operator:
             self._operator = None
-            self._wearer.leave(reason)
+            self._device.leave(reason)
 
 
 def _make_logger() -> logging.Logger:
-    """A logger that ignores malformed HTTP."""
+    """Return a logger that ignores malformed HTTP requests."""
     own = logging.getLogger(f"{__name__}.http")
     own.addFilter(_is_our_fault)
     return own
@@ -304,7 +304,7 @@ def _is_our_fault(record: logging.LogRecord) -> bool:
 
 
 def _is_own_page(request: web.Request) -> bool:
-    """Whether the connection was not opened by a page of another site."""
+    """Whether the connection was not opened by a page of another origin."""
     origin = request.headers.get("Origin")
     return origin is None or urlsplit(origin).netloc == request.host
 
