@@ -17,7 +17,7 @@ from xop_lerobot.operator.devices import DEVICES, DeviceConfig
 from xop_lerobot.operator.display import Cue, Display, RecordingRequest
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.recording.facts import read_facts
-from xop_lerobot.recording.requests import Tally, grant
+from xop_lerobot.recording.requests import EpisodeCounts, grant
 
 POSTURES = {
     "rest": (quat_from_rpy(0, 0, 0), 1.1),
@@ -169,17 +169,19 @@ def test_what_nobody_has_driven_is_no_episode(tmp_path, monkeypatch, command):
 # -- what is granted -----------------------------------------------------------------------
 
 
-def make_tally(**fields) -> Tally:
-    tally = Tally()
-    tally.frames = 10
+def make_tally(**fields) -> EpisodeCounts:
+    counts = EpisodeCounts()
+    counts.frames = 10
     for name, value in ({"driven": True} | fields).items():
-        setattr(tally, name, value)
-    return tally
+        setattr(counts, name, value)
+    return counts
 
 
-def ask(request: RecordingRequest, tally: Tally | None = None, *, paused=False, discarded=False):
+def ask(
+    request: RecordingRequest, counts: EpisodeCounts | None = None, *, paused=False, discarded=False
+):
     events = {"exit_early": False, "rerecord_episode": discarded, "stop_recording": False}
-    cue, text = grant(request, events, tally or make_tally(), paused=paused, time=0.4)
+    cue, text = grant(request, events, counts or make_tally(), paused=paused, time=0.4)
     return cue, text, {name for name, value in events.items() if value}
 
 
@@ -191,18 +193,18 @@ def test_requests_are_granted_as_keys_are():
 
 
 def test_a_second_mark_takes_the_first_one_off():
-    tally = make_tally()
+    counts = make_tally()
     for success, text in (
         (True, "The episode is marked as a success."),
         (False, "The episode is not marked as a success any more."),
     ):
-        assert ask(RecordingRequest.SUCCESS, tally)[:2] == (Cue.SUCCESS, text)
-        assert (tally.success, tally.marked) == (success, success)
+        assert ask(RecordingRequest.SUCCESS, counts)[:2] == (Cue.SUCCESS, text)
+        assert (counts.success, counts.marked) == (success, success)
     # Also where the task itself has found a success that is none.
-    tally = make_tally(success=True)
-    ask(RecordingRequest.SUCCESS, tally)
-    assert tally.success is False
-    assert [each["change"] for each in tally.changes] == [{"success": False}]
+    counts = make_tally(success=True)
+    ask(RecordingRequest.SUCCESS, counts)
+    assert counts.success is False
+    assert [each["change"] for each in counts.changes] == [{"success": False}]
 
 
 def test_what_is_refused_says_why():

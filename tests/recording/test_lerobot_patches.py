@@ -122,8 +122,8 @@ def take_nothing() -> None:
             dataset_metadata.LeRobotDatasetMetadata, "save_episode", take_nothing,
             "'metadata of an episode', made for 0.6.1: "
             "lerobot.datasets.dataset_metadata.LeRobotDatasetMetadata.save_episode() must take "
-            "episode_metadata, and takes none. Facts on episodes are only in "
-            "meta/xop/episodes.jsonl, where `xop-curate` reads them.",
+            "episode_metadata, and takes none. Episode metadata is only in "
+            "meta/xop/episodes.jsonl, where `xop-curate` reads it.",
         ),
         (
             dataset_metadata, "LeRobotDatasetMetadata", Other,
@@ -139,7 +139,7 @@ def take_nothing() -> None:
             "lerobot.datasets.dataset_metadata.LeRobotDatasetMetadata must have _pq_writer, "
             "_finalized, _metadata_buffer, and has no _pq_writer, _finalized, _metadata_buffer. If "
             "an episode cannot be saved, the dataset may be left unreadable: `xop-curate repair` "
-            "makes a whole one of it.",
+            "restores what is complete.",
         ),
         (
             image_writer, "AsyncImageWriter", Renamed,

@@ -200,7 +200,7 @@ def test_a_damaged_dataset_is_repaired(session, recorded, tmp_path, damage):
         XopDataset.bind(session).resume("local/toy", root=root)
     text = str(refusal.value)
     assert text.startswith(f"dataset '{root}': it cannot be read (")
-    assert text.endswith(f"`xop-curate repair --root {root} --out DIR` makes a whole one of it")
+    assert text.endswith(f"`xop-curate repair --root {root} --out DIR` restores what is complete")
     robot.disconnect()
 
 

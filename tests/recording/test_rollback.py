@@ -96,8 +96,8 @@ def test_a_full_disk_costs_one_episode(
         dataset.save_episode()
     dataset.finalize()
     assert str(caught.value) == (
-        f"episode 2 could not be saved to '{root}': {FULL}. What was saved before it is whole: 2 "
-        "episodes. Once that is mended, --resume=true goes on"
+        f"episode 2 could not be saved to '{root}': {FULL}. What was saved before it is complete: "
+        "2 episodes. Fix the cause, then continue with --resume=true"
     )
     assert read_files(root) == before
     assert not list(root.glob("tmp*"))
@@ -147,8 +147,8 @@ def test_what_cannot_be_taken_back_is_repaired(
         dataset.save_episode()
     assert str(caught.value) == (
         f"episode 1 could not be saved to '{root}': {FULL}. What it left there could not be "
-        f"removed. `xop-curate repair --root {root} --out DIR` makes a whole dataset of the "
-        "episodes before it"
+        f"removed. `xop-curate repair --root {root} --out DIR` restores the episodes before "
+        "it"
     )
 
 

@@ -56,12 +56,12 @@ from xop_lerobot.recording.opening import (
     check_resumable,
     find_unreadable,
 )
-from xop_lerobot.recording.requests import Tally, grant
+from xop_lerobot.recording.requests import EpisodeCounts, grant
 from xop_lerobot.recording.rollback import (
     check_pictures,
     find_reason,
     raise_if_not_written,
-    taken_back_on_failure,
+    rolled_back_on_failure,
 )
 from xop_lerobot.recording.writer import VideoQueue, keep_schedule, skip_embedding
 from xop_lerobot.session import RobotInfo, Session, Tick, get_session
@@ -201,7 +201,7 @@ class XopDataset(LeRobotDataset):
         self._info, self._columns = info, columns
         self._create_options = options
         self._keep_facts, self._own_root = True, False
-        self._tally = Tally()
+        self._counts = EpisodeCounts()
         self._tick_limit: int | None = None
         self._stop_on_success = self._paused = False
         self._events: MutableMapping[str, bool] = {}
@@ -277,7 +277,7 @@ class XopDataset(LeRobotDataset):
         the previous episode. Only Esc still counts: it ends the session, and an episode without
         frames is left out.
         """
-        if self._tally.frames or not self._events:
+        if self._counts.frames or not self._events:
             return
         stops = self._events.get("stop_recording", False)
         self._events["exit_early"] = self._events["rerecord_episode"] = stops
@@ -293,10 +293,10 @@ class XopDataset(LeRobotDataset):
         """Fulfil a request of the operator; return the notice for the operator."""
         tick = self._session.tick
         time = 0.0 if tick is None else tick.state.time
-        told = grant(request, self._events, self._tally, paused=self._paused, time=time)
+        told = grant(request, self._events, self._counts, paused=self._paused, time=time)
         progress = self._session.progress
         if progress is not None:
-            self._session.progress = dataclasses.replace(progress, success=self._tally.success)
+            self._session.progress = dataclasses.replace(progress, success=self._counts.success)
         return told
 
     def add_frame(self, frame: dict) -> None:
@@ -308,38 +308,38 @@ class XopDataset(LeRobotDataset):
             BadValue: If the frame belongs to an earlier tick, whose columns are gone.
             NotSaved: If it cannot be written, usually because the disk is full.
         """
-        tally, tick = self._tally, self._session.tick
+        counts, tick = self._counts, self._session.tick
         frame = put_executed(frame, tick, self.meta.features)
         if self._columns is not None:
             frame = {**frame, **self._columns.build_row(self._check_order(tick))}
         if not self._info.realtime:
             self._video.wait()
         self._video.wait_for_images()
-        tally.task = str(frame["task"])
+        counts.task = str(frame["task"])
         try:
             super().add_frame(frame)
         except Exception as error:
             raise_if_not_written(self, error)
             raise
         if tick is not None:
-            tally.note_state(tick.state)
-            tally.note_changes(tick)
-            tally.driven |= tick.engaged
+            counts.note_state(tick.state)
+            counts.note_changes(tick)
+            counts.driven |= tick.engaged
 
-        tally.last = time.perf_counter()
-        if tally.frames == 0:
-            tally.first, tally.start_time = tally.last, time.time()
-        tally.frames += 1
+        counts.last = time.perf_counter()
+        if counts.frames == 0:
+            counts.first, counts.start_time = counts.last, time.time()
+        counts.frames += 1
         outcome = None if tick is None else tick.outcome
-        tally.success = outcome is not None and outcome.success
-        if tally.marked is not None:
-            tally.success = tally.marked
-        tally.finished = tick is not None and tick.finished
-        is_over = tally.finished or tally.frames == self._tick_limit
-        if is_over or (self._stop_on_success and tally.success):
+        counts.success = outcome is not None and outcome.success
+        if counts.marked is not None:
+            counts.success = counts.marked
+        counts.finished = tick is not None and tick.finished
+        is_over = counts.finished or counts.frames == self._tick_limit
+        if is_over or (self._stop_on_success and counts.success):
             self._events["exit_early"] = True
-        length = tally.frames / self.fps
-        self._session.progress = Progress(self.num_episodes, tally.frames, length, tally.success)
+        length = counts.frames / self.fps
+        self._session.progress = Progress(self.num_episodes, counts.frames, length, counts.success)
 
     def _check_order(self, tick: Tick | None) -> Tick:
         """Check that a frame of `tick` can be recorded now; see `add_frame`."""
@@ -380,9 +380,9 @@ class XopDataset(LeRobotDataset):
             raise XopError(
                 f"episode {index} lost {facts.dropped_frames} video frames; it is not saved"
             )
-        length = self._tally.frames
-        self._tally.write_mark(episode_data or (self.writer.episode_buffer if self.writer else {}))
-        with hold_signals(), skip_embedding(self), keep_schedule(), taken_back_on_failure(self):
+        length = self._counts.frames
+        self._counts.write_mark(episode_data or (self.writer.episode_buffer if self.writer else {}))
+        with hold_signals(), skip_embedding(self), keep_schedule(), rolled_back_on_failure(self):
             check_pictures(self, index)
             super().save_episode(episode_data, parallel_encoding)
             self._secure()
@@ -418,7 +418,7 @@ class XopDataset(LeRobotDataset):
             shutil.rmtree(self.root, ignore_errors=True)
 
     def _begin_next(self, index: int) -> None:
-        self._tally, self._events = Tally(), {}
+        self._counts, self._events = EpisodeCounts(), {}
         self._session.progress = None
         self._session.begin_episode(index)
 
@@ -438,4 +438,4 @@ class XopDataset(LeRobotDataset):
         self._attach_writer()
 
     def _collect_facts(self) -> EpisodeFacts:
-        return gather_facts(self._tally, self._info, self._config_hash, self._video.dropped)
+        return gather_facts(self._counts, self._info, self._config_hash, self._video.dropped)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from xop_lerobot.core.versions import read_versions
 
 if TYPE_CHECKING:
-    from xop_lerobot.recording.requests import Tally
+    from xop_lerobot.recording.requests import EpisodeCounts
     from xop_lerobot.session import RobotInfo
 
 from xop_lerobot.core.folders import append_line, read_lines
@@ -90,34 +90,36 @@ _LATE = 0.95
 """Share of the nominal rate below which a real-time episode is marked as late."""
 
 
-def gather_facts(tally: Tally, info: RobotInfo, config_hash: str, dropped: int) -> EpisodeFacts:
+def gather_facts(
+    counts: EpisodeCounts, info: RobotInfo, config_hash: str, dropped: int
+) -> EpisodeFacts:
     """Collect the metadata of the episode being recorded.
 
     Args:
-        tally: Its counts.
+        counts: Its counts.
         info: Its robot.
         config_hash: Hash of its configuration.
         dropped: Number of video frames dropped by the encoder.
     """
     return EpisodeFacts(
-        success=tally.success,
-        fallen=tally.fallen,
-        collision=tally.collision,
-        finished=tally.finished,
+        success=counts.success,
+        fallen=counts.fallen,
+        collision=counts.collision,
+        finished=counts.finished,
         seed=info.seed,
-        task=tally.task,
+        task=counts.task,
         robot=info.name,
         scene=info.scene,
         low_level=info.low_level,
         clock="realtime" if info.realtime else "lockstep",
         config_hash=config_hash,
         versions=read_versions(),
-        start_time=tally.start_time,
-        real_fps=tally.fps,
+        start_time=counts.start_time,
+        real_fps=counts.fps,
         dropped_frames=dropped,
-        settings=json.dumps(tally.settings),
-        changes=json.dumps(tally.changes),
-        late=info.realtime and tally.frames > 1 and tally.fps < _LATE * info.fps,
+        settings=json.dumps(counts.settings),
+        changes=json.dumps(counts.changes),
+        late=info.realtime and counts.frames > 1 and counts.fps < _LATE * info.fps,
     )
 
 

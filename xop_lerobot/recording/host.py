@@ -32,7 +32,7 @@ from xop_lerobot.recording.lerobot_patches import (
     get_stock,
     runs,
 )
-from xop_lerobot.recording.lockstep import count_ticks, without_slowness
+from xop_lerobot.recording.lockstep import count_ticks, without_slow_step_warnings
 from xop_lerobot.session import get_session
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ class Host:
                     # Resets happen inside an observation; do it before the episode's time starts.
                     call["robot"].get_observation()
                 if lockstep:
-                    with without_slowness():
+                    with without_slow_step_warnings():
                         stock(**call)
                     return
             stock(**call)
@@ -160,7 +160,7 @@ def count_in_frames(stock: Callable[..., None], session: str) -> Callable[..., N
         _check_multiplier(call["self"], dataset.fps)
         dataset.begin(call["events"], count_ticks(call["control_time_s"], dataset.fps))
         call["control_time_s"] = math.inf
-        with without_slowness():
+        with without_slow_step_warnings():
             stock(**call)
 
     return policy_loop

@@ -95,7 +95,7 @@ DATASET = Patch(
         "lerobot.datasets:LeRobotDataset.clear_episode_buffer()": ("delete_images",),
         "lerobot.datasets:LeRobotDataset.finalize()": (),
     },
-    purpose="XopDataset adds columns, facts on episodes and files that survive a killed process.",
+    purpose="XopDataset adds columns, episode metadata and files that survive a killed process.",
     waits_for="hooks for more columns and for the boundaries of episodes",
     without=f"Nothing can be recorded. Install LeRobot {MADE_FOR}, or a newer xop-lerobot.",
     required=True,  # every command records through this class
@@ -158,10 +158,10 @@ EPISODE_METADATA = Patch(
     "metadata of an episode",
     Use.WRAPPED,  # on the one instance of a dataset that is recorded
     {f"{_METADATA}.save_episode()": ("episode_metadata",)},
-    purpose="The facts on an episode stand in LeRobot's own metadata of it.",
+    purpose="This project's episode metadata is also in LeRobot's own.",
     waits_for="#2999: metadata for each episode",
     # They are written twice.
-    without="Facts on episodes are only in meta/xop/episodes.jsonl, where `xop-curate` reads them.",
+    without="Episode metadata is only in meta/xop/episodes.jsonl, where `xop-curate` reads it.",
 )
 ROTATION = Patch(
     "files of an episode",
@@ -193,7 +193,7 @@ ROLLBACK = Patch(
     waits_for="a save in LeRobot that takes back what it began",
     # It concerns saves that fail, and those can be repaired.
     without="If an episode cannot be saved, the dataset may be left unreadable: `xop-curate "
-    "repair` makes a whole one of it.",
+    "repair` restores what is complete.",
 )
 ENCODER = Patch(
     "queues of the video encoder",

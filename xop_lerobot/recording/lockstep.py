@@ -10,7 +10,7 @@ from xop_lerobot.recording.lerobot_patches import SLOW_TICK_LOGGERS, SLOW_TICK_T
 
 
 @contextmanager
-def without_slowness() -> Iterator[None]:
+def without_slow_step_warnings() -> Iterator[None]:
     """Suppress LeRobot's warnings of slow steps: in lock-step they do not affect the data."""
 
     def is_other(record: logging.LogRecord) -> bool:

@@ -98,7 +98,7 @@ def find_unreadable(folder: Path, repo_id: str, error: Exception) -> BadDataset:
     first = (str(error).splitlines() or [""])[0]
     fault = f"it cannot be read ({type(error).__name__}: {first}). "
     if (folder / "meta" / "info.json").exists():
-        fault += f"`xop-curate repair --root {folder} --out DIR` makes a whole one of it"
+        fault += f"`xop-curate repair --root {folder} --out DIR` restores what is complete"
     else:
         fault = (
             f"there is none to add to, nor is '{repo_id}' on the Hub or within reach. "

@@ -12,7 +12,7 @@ from xop_lerobot.operator.display import Cue, RecordingRequest
 from xop_lerobot.session import Tick
 
 
-class Tally:
+class EpisodeCounts:
     """Counts, times and flags of the episode being recorded.
 
     Attributes:
@@ -88,7 +88,7 @@ class Tally:
 def grant(
     request: RecordingRequest,
     events: MutableMapping[str, bool],
-    tally: Tally,
+    counts: EpisodeCounts,
     *,
     paused: bool,
     time: float,
@@ -102,7 +102,7 @@ def grant(
     Args:
         request: The request.
         events: Events of the recording loop; set here.
-        tally: Counts of the episode.
+        counts: Counts of the episode.
         paused: Whether this is the pause after an episode.
         time: The robot's clock [s].
 
@@ -111,46 +111,48 @@ def grant(
     """
     match request:
         case RecordingRequest.SUCCESS:
-            return _mark(events, tally, paused, time)
+            return _mark(events, counts, paused, time)
         case RecordingRequest.END:
-            return _end(events, tally, paused)
+            return _end(events, counts, paused)
         case RecordingRequest.REDO:
             if paused and events["rerecord_episode"]:
                 return Cue.REFUSED, "The episode has been discarded already."
             events["rerecord_episode"] = events["exit_early"] = True
             return Cue.REDO, "Redo: the episode is discarded, and recorded again."
         case RecordingRequest.STOP:
-            return _stop(events, tally, paused)
+            return _stop(events, counts, paused)
 
 
 def _mark(
-    events: MutableMapping[str, bool], tally: Tally, paused: bool, time: float
+    events: MutableMapping[str, bool], counts: EpisodeCounts, paused: bool, time: float
 ) -> tuple[Cue, str]:
     if paused and events["rerecord_episode"]:
         return Cue.REFUSED, "Not marked: the episode has been discarded."
-    if not tally.driven:
+    if not counts.driven:
         return Cue.REFUSED, "Not marked: nothing has been driven in this episode yet."
-    tally.mark(not tally.success, time)
-    if tally.success:
+    counts.mark(not counts.success, time)
+    if counts.success:
         return Cue.SUCCESS, "The episode is marked as a success."
     return Cue.SUCCESS, "The episode is not marked as a success any more."
 
 
-def _end(events: MutableMapping[str, bool], tally: Tally, paused: bool) -> tuple[Cue, str]:
+def _end(events: MutableMapping[str, bool], counts: EpisodeCounts, paused: bool) -> tuple[Cue, str]:
     if paused:
         events["exit_early"] = True
         return Cue.END, "The pause is over: the next episode begins."
-    if not tally.driven:
+    if not counts.driven:
         return Cue.REFUSED, "Not ended: nothing has been driven in this episode yet."
     events["exit_early"] = True
     return Cue.END, "End: the episode is saved."
 
 
-def _stop(events: MutableMapping[str, bool], tally: Tally, paused: bool) -> tuple[Cue, str]:
+def _stop(
+    events: MutableMapping[str, bool], counts: EpisodeCounts, paused: bool
+) -> tuple[Cue, str]:
     events["stop_recording"] = events["exit_early"] = True
     if paused and events["rerecord_episode"]:
         return Cue.STOP, "Stop: the session ends."
-    if tally.driven:
+    if counts.driven:
         return Cue.STOP, "Stop: the episode is saved, and the session ends."
     events["rerecord_episode"] = True  # makes LeRobot's loops discard the episode
     return Cue.STOP, "Stop: the session ends. Nothing was driven in this episode: it is not kept."

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _FOLDERS = ("data", "videos", "meta")
 _TEMPORARY = "tmp????????"
 """LeRobot's temporary directories for videos being encoded, inside the dataset."""
-_LITTLE = 1 << 20
+_FULL_BELOW = 1 << 20
 """Free space below which a full disk is assumed to be the reason for missing files [byte]."""
 
 
@@ -46,12 +46,12 @@ class NotSaved(XopError):
         if not whole:
             text += (
                 f"What it left there could not be removed. `xop-curate repair --root {root} --out "
-                "DIR` makes a whole dataset of the episodes before it"
+                "DIR` restores the episodes before it"
             )
         elif index:
             text += (
-                f"What was saved before it is whole: {say_count(index, 'episode')}. Once that is "
-                "mended, --resume=true goes on"
+                f"What was saved before it is complete: {say_count(index, 'episode')}. Fix the "
+                "cause, then continue with --resume=true"
             )
         else:
             text += "None was saved before it"
@@ -137,7 +137,7 @@ def _drop(parquet: Any) -> None:
 
 
 @contextmanager
-def taken_back_on_failure(dataset: LeRobotDataset) -> Iterator[None]:
+def rolled_back_on_failure(dataset: LeRobotDataset) -> Iterator[None]:
     """Save an episode in the block; on failure roll back and close `dataset`.
 
     Raises:
@@ -193,7 +193,7 @@ def check_pictures(dataset: LeRobotDataset, index: int) -> None:
     lost = [path for path in paths if not path.is_file() or path.stat().st_size == 0]
     if lost:
         reason = f"{len(lost)} of its {say_count(len(paths), 'image')} could not be written"
-        if shutil.disk_usage(dataset.root).free < _LITTLE:
+        if shutil.disk_usage(dataset.root).free < _FULL_BELOW:
             reason = f"{os.strerror(errno.ENOSPC)}; {reason}"
         raise NotSaved(dataset.root, index, reason)
 
