@@ -209,7 +209,7 @@ def add_config(
     add("cameras", "cameras, comma-separated", type=split)
     add("low-level", "low-level policy; default: the robot's own")
     add("low-level-path", "file of the low-level policy; empty: its default")
-    add("fps", "rate of control and dataset [Hz], a divisor of 50", type=int)
+    add("fps", "rate of control and dataset [Hz]; divides 50", type=int)
     add("width", "image width [pixel]", type=int)
     add("height", "image height [pixel]", type=int)
     add("noise", "sensor noise: off, mild or harsh")

@@ -51,7 +51,7 @@ class Collector:
 
     def __init__(self, config: CollectConfig, run: float) -> None:
         import_plugins(config.plugins)
-        _calm_down()
+        _quieten_logs()
         self.config, self.run = config, run
         self.robot: XopRobot = make_device_from_device_class(config.make_robot_config())
         self.session = get_session(self.robot.config.session)
@@ -157,7 +157,7 @@ class Collector:
         self.robot.disconnect()
 
 
-def _calm_down() -> None:
+def _quieten_logs() -> None:
     """Silence the log output of encoders and decoders."""
     av.logging.set_libav_level(av.logging.ERROR)
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

@@ -25,7 +25,7 @@ from xop_lerobot.operator.dataset_recording import CLOCKS
 from xop_lerobot.operator.recording import FARTHEST_M
 from xop_lerobot.operator.row_clock import LONGEST_HOLD_S, read_row_clock
 
-_ANEW = "`xop-curate filter` renumbers it"
+_FIX = "`xop-curate filter` renumbers it"
 _TOLERANCE_S = 1e-4
 """LeRobot's tolerance between the time stamps of a row and of its image [s]."""
 _POSES = ("operator.", "goal.", "robot.")
@@ -77,12 +77,12 @@ class OrderCheck:
             before = f"comes after {number - 1}" if number else "is the first"
             problems.append(
                 f"episode {entry.index} {before}, but LeRobot assumes episodes numbered from 0 "
-                f"without gaps. {_ANEW}"
+                f"without gaps. {_FIX}"
             )
         if entry.place is not None and entry.place != place:
             problems.append(
                 f"the metadata puts episode {entry.index} at the rows {_say(entry.place)}, "
-                f"it is the rows {_say(place)}. {_ANEW}"
+                f"it is the rows {_say(place)}. {_FIX}"
             )
         if rows is not None and entry.length:
             problems += self._check_counters(entry, rows, place)
@@ -111,7 +111,7 @@ class OrderCheck:
                 row = int(np.argmax(wrong))
                 yield (
                     f"'{name}' of episode {entry.index} must be {expected[row]:g} in row {row}, it "
-                    f"is {values[row]:.10g}. {_ANEW}"
+                    f"is {values[row]:.10g}. {_FIX}"
                 )
 
     def _check_words(self, entry: EpisodeEntry, rows: Mapping[str, np.ndarray]) -> Iterator[str]:

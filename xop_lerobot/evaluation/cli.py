@@ -57,7 +57,7 @@ def make_parser() -> CommandParser:
     add("--scene", help="scene (default: the task's own)")
     add("--heights", help="heights that override the task's, support=0.35,table=0.6:0.7 or "
         "points=0.3:0.5 [m] (default: the task's own)")  # fmt: skip
-    add("--fps", type=int, help="rate of the control loop, a divisor of 50 [Hz] (default: 25)")
+    add("--fps", type=int, help="rate of the control loop, divides 50 [Hz] (default: 25)")
     add("--time-limit", type=float,
         help="time limit of an episode [s] (default: the task's own)")  # fmt: skip
     add("--workers", type=int, default=0, help="parallel processes; 0: cores (default: 0)")
