@@ -13,8 +13,6 @@ from xop_lerobot.core.transforms import make_pose
 from xop_lerobot.morphology.links import FLOOR_BIT, OBJECT_BIT
 
 if TYPE_CHECKING:
-    import mujoco
-
     from xop_lerobot.plant.simulation import Simulation
 
 PARKING = (30.0, 30.0)
@@ -71,8 +69,6 @@ def add_solid(
         colour: Red, green, blue, opacity.
         friction: Sliding, torsional [m], rolling [m].
     """
-    import mujoco  # noqa: PLC0415
-
     return body.add_geom(
         name=name,
         type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}"),
@@ -125,8 +121,6 @@ def add_grip(
         MuJoCo's documentation, Computation, "Constraint model" (reference acceleration), and
         XML reference, contact/pair, ``solreffriction``.
     """
-    import mujoco  # noqa: PLC0415
-
     sliding, torsion, rolling = friction
     for site in sites:
         hand = next(each for each in spec.sites if each.name == site).parent

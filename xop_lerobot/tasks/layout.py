@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -13,9 +12,6 @@ from xop_lerobot.core.transforms import make_pose, pose_multiply, quat_from_matr
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.retarget.arms.ik import ArmIk
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
-
-if TYPE_CHECKING:
-    import mujoco
 
 DRAW_IN = 0.12
 """Largest distance by which hands are drawn in [m]."""
