@@ -23,6 +23,7 @@ from xop_lerobot.core.paced_log import PacedLog
 logger = logging.getLogger(__name__)
 
 _MAX_CLIENTS = 8
+"""Largest number of clients; each has a thread."""
 _MAX_RATE = 100.0
 """Accepted requests and connections per second, over all clients [Hz]."""
 _BURST = 50

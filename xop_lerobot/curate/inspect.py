@@ -183,7 +183,9 @@ _HEADS = {
 }
 """Column heads that are shorter than the metric's name."""
 _WIDTHS = {"robot": 8, "task": 40, "scene": 10, "low_level": 10, "clock": 8, "preset": 12}
+"""Widths of text columns [characters]; longer texts are cut off."""
 _MINIMUM = 5
+"""Width of number columns [characters]."""
 
 
 class Table:
@@ -302,6 +304,7 @@ _COUNTED = {
 }
 """Metrics counted by the number of episodes in which they are true or above 0."""
 _LISTED = 8
+"""Number of robots or tasks listed by name in the totals."""
 
 
 def _count(counts: dict[str, int], value: str | None) -> None:

@@ -103,6 +103,7 @@ DEVICE = "retarget"
 DEFAULT_FPS = 25
 """Rate of the new dataset if the robots cannot run at that of the source [Hz]."""
 POLICY_HZ = 50
+"""Rate of every low-level policy [Hz]; the control rate must divide it."""
 
 
 @dataclass(frozen=True)

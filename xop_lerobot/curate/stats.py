@@ -23,6 +23,7 @@ from xop_lerobot.curate.entries import EPISODES_DIR
 
 _PREFIX = "stats/"
 _BATCH = 32
+"""Number of episodes whose statistics are in memory at a time."""
 type Stats = dict[str, dict[str, np.ndarray]]
 
 

@@ -30,6 +30,7 @@ from xop_lerobot.core.errors import BadDataset
 _LENGTH = 4
 """Size of a unit's length prefix [bytes], the same for every encoder that LeRobot uses."""
 _OBU_EXTENDED, _OBU_SIZED = 0x04, 0x02
+"""Header bits of an OBU: an extension byte follows; a length follows."""
 _OBU_KINDS = (1, 2, 3, 4, 5, 6, 7, 8, 15)
 """All defined OBU types; the others are reserved."""
 _OBU_PICTURES = (4, 6)

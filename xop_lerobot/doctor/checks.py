@@ -82,6 +82,7 @@ def check_gl(setup: Setup) -> Finding:
 
 
 ENOUGH_GB, LEAST_GB = 10.0, 1.0
+"""Free space below which the check warns, and fails [GB]."""
 
 
 def check_disk(setup: Setup) -> Finding:
@@ -111,6 +112,7 @@ def check_disk(setup: Setup) -> Finding:
 
 
 STEPS, WARMUP = 40, 10
+"""Timed and untimed plans of the CPU check."""
 SHARE = 0.8
 """Share of the period above which the planner leaves too little time for the rest."""
 

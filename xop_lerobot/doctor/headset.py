@@ -41,6 +41,7 @@ def check_certificate(setup: Setup) -> Finding:
 
 
 TIMEOUT_S = 3.0
+"""Time to wait for a connection to the headset [s]."""
 
 
 def check_ports(setup: Setup) -> Finding:
@@ -88,6 +89,7 @@ def _check_connection(host: str, port: int) -> Finding:
 
 
 GOOD_HZ, LEAST_HZ = 50.0, 25.0
+"""Stream rates below which the check warns, and fails [Hz]."""
 SLOW_S = 0.1
 """Delay above which an operator notices it [s]."""
 

@@ -37,6 +37,7 @@ from xop_lerobot.evaluation.trial import Film, TrialSetup, make_stage
 from xop_lerobot.plant.rendering import RenderingUnavailable
 
 WIDTH, HEIGHT = 320, 240
+"""Size of the videos [px]."""
 CAMERA = "task"
 LOOK_HEIGHT, DISTANCE = 0.75, 2.6
 """Height above the ground of a following camera's target, and its distance [m]."""

@@ -33,6 +33,7 @@ SHOULDERS = (0.0, 0.5)
 MAX_GAP = 0.3
 """Longest time between frames that continues a measurement [s]."""
 RATE_HZ = 50.0
+"""Rate at which frames are read [Hz]."""
 HINT_S = 2.0
 """Time for which a problem must persist before it is shown [s]."""
 

@@ -21,6 +21,7 @@ SCRIPTS = Path(__file__).parent / "scripts"
 OPEN_PINCH = 0.08
 """Distance of thumb and index tip of an open hand [m]."""
 CLOSED_PINCH = 0.008
+"""Distance of thumb and index tip in a scripted pinch [m]."""
 HANDS = ("left", "right")
 WRISTS_IN = ("world", "body")
 KEYS = (

@@ -68,6 +68,7 @@ def skip_embedding(dataset: LeRobotDataset) -> Iterator[None]:
 MAX_IMAGES = 256
 """Largest number of images waiting for the disk."""
 _POLL_S = 0.001
+"""Interval of checking a full queue [s]."""
 
 
 class VideoQueue:

@@ -16,6 +16,7 @@ from xop_lerobot.retarget.model.kinematics import SiteKinematics
 DRAW_IN = 0.12
 """Largest distance by which hands are drawn in [m]."""
 _STEPS, _DT, _NEAR = 50, 0.04, 0.005
+"""Inverse kinematics: iterations, time step [s], and error that counts as reached [m]."""
 
 
 @dataclass(frozen=True)

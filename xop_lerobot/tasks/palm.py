@@ -24,6 +24,7 @@ TRAY_HALF = (0.05, 0.05, 0.003)
 BARE_EDGE = 0.034
 """Distance from the middle of a hand without a tray to its edge [m]."""
 _STEPS, _DT = 150, 0.04
+"""Inverse kinematics: iterations, and time step [s]."""
 
 
 def find_start_arms(

@@ -36,6 +36,7 @@ RENEW = datetime.timedelta(days=30)
 SKEW = datetime.timedelta(hours=1)
 """Tolerated lag of a headset's clock."""
 MAX_NAMES = 64
+"""Largest number of names and addresses in it."""
 
 
 class CertificateFault(XopError):

@@ -18,6 +18,7 @@ ALPHABET = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 """Letters and digits that cannot be confused."""
 LENGTH = 8
 MIN_LENGTH = 6
+"""Shortest code that a user may choose [characters]."""
 MAX_WRONG = 5
 """Number of wrong codes from one address before it is blocked."""
 BLOCK_S = 60.0
@@ -90,6 +91,7 @@ class RateLimit:
 
 
 MAX_CONNECTIONS = 64
+"""Largest number of open connections, and of those being set up."""
 FIRST_REQUEST_S = 10.0
 """Time without a request after which a connection is closed [s]."""
 

@@ -14,6 +14,7 @@ from PIL import Image
 logger = logging.getLogger(__name__)
 
 QUALITY = 70
+"""JPEG quality, of 100."""
 MAX_SIDE = 1280
 """Longest side of a transmitted image; larger images are scaled down [px]."""
 MAX_CAMERAS = 4

@@ -45,6 +45,7 @@ _WORLD_QUAT = quat_from_matrix(WORLD)
 _PARALLEL_QUAT = quat_from_matrix(PARALLEL)
 _GRIP_QUATS = {side: quat_from_matrix(axes) for side, axes in GRIPS.items()}
 _NOWHERE = np.full(7, np.nan)
+"""Pose of a limb that is not tracked."""
 
 
 @dataclass(frozen=True)
