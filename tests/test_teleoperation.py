@@ -226,7 +226,7 @@ def test_a_lost_head_stops_the_robot_and_the_next_engagement_aligns_anew(rig, na
     action, record = stopping[-1]
     assert not record.engaged
     lost = "Disengaged: the headset has lost its position, or sends nothing."
-    assert caplog.messages.count(f"{lost} The robot holds until that is over.") == 1
+    assert caplog.messages.count(f"{lost} The robot holds until tracking returns.") == 1
     assert action.mode is Mode.STATIONARY
     np.testing.assert_array_equal(action.command[r.morphology.command_space.mobile_only], 0)
     arms = stopping[0][0].arms

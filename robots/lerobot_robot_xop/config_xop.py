@@ -82,7 +82,7 @@ class XopRobotConfig(RobotConfig):
         self.task_heights = find_text(self.task_heights)
         if parse_heights(self.task_heights) and not self.task:
             raise BadValue(
-                f"robot.task_heights={self.task_heights} is for a task. Give it with --robot.task"
+                f"robot.task_heights={self.task_heights} needs a task. Pass --robot.task"
             )
         recover_typed(self, "robot", "session")
         recover_typed(self.low_level, "robot.low_level", "path")

@@ -128,8 +128,8 @@ def test_end_redo_mark_and_stop(tmp_path, monkeypatch, command):
         "Stop: the episode is saved, and the session ends.",
     ]  # fmt: skip
     assert {display.holding for display in Puppet.shown} == {
-        "", "Hold on to engage", "Hold on to end the episode", "Hold on to discard the episode",
-        "Hold on to stop the session",
+        "", "Keep holding to engage", "Keep holding to end the episode",
+        "Keep holding to discard the episode", "Keep holding to stop the session",
     }  # fmt: skip
 
 

@@ -472,7 +472,7 @@ def test_videos_are_not_encoded_in_batches(session, pair, tmp_path):
         create(session, pair[0], root, batch_encoding_size=2)
     assert str(error.value) == (
         "--dataset.video_encoding_batch_size must be 1, got 2: an episode is saved with its "
-        "videos, so that what happens later can't take them. To save sooner, use "
+        "videos, so that a later failure cannot lose them. To save sooner, use "
         "--dataset.streaming_encoding=true"
     )
     assert not root.exists()

@@ -22,7 +22,7 @@ from xop_lerobot.recording.record import build_features
 
 pytestmark = pytest.mark.slow
 
-HINT = "Record as it was recorded, or begin another --dataset.root without --resume=true"
+HINT = "Record with the same settings, or start another --dataset.root without --resume=true"
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ CHANGES = {
     ),
     "other joints": (
         set_names("action", lambda names: ["grip.pos", *names[1:]]),
-        "its action lacks lift.pos; its action has grip.pos, which the robot has not",
+        "its action lacks lift.pos; its action has grip.pos, which the robot lacks",
     ),
     "a smaller state": (
         set_names("observation.state", lambda names: names[4:]),
@@ -183,8 +183,8 @@ def test_what_is_no_dataset(session, tmp_path, monkeypatch):
         with pytest.raises(BadDataset) as absent:
             bound.resume("local/toy", root=tmp_path / name)
         assert str(absent.value) == (
-            f"dataset '{tmp_path}/{name}': there is none to add to, nor is 'local/toy' on the Hub "
-            "or within reach. Leave --resume out to begin it"
+            f"dataset '{tmp_path}/{name}': there is no dataset, and 'local/toy' was not found on "
+            "the Hub either. Omit --resume to create it"
         )
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
     robot.disconnect()

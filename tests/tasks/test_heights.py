@@ -151,7 +151,7 @@ def test_tasks_without_heights_say_so():
 
 
 def test_heights_without_a_task_are_none():
-    fault = r"robot\.task_heights=points=0\.4 is for a task\. Give it with --robot\.task"
+    fault = r"robot\.task_heights=points=0\.4 needs a task\. Pass --robot\.task"
     with pytest.raises(BadValue, match=fault):
         XopG1Config(task_heights="points=0.4")
     assert XopG1Config(task_heights="none").task_heights == ""

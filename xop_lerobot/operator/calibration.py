@@ -192,7 +192,7 @@ def _find_fault(frame: OperatorFrame, arms: np.ndarray) -> str:
     if not all(SHOULDERS[0] <= -z <= SHOULDERS[1] for z in arms[:, 2]):
         return "Hold your hands level with your shoulders."
     if reach > ARM_REACH[1]:
-        return f"Your hands seem to be {reach:.2f} m away, farther than anybody's."
+        return f"Your hands seem to be {reach:.2f} m away, farther than any arm reaches."
     return ""
 
 

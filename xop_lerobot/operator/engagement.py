@@ -247,7 +247,7 @@ class Engagement:
                 self.disengage()
                 reason = self.device.trouble or UNSEEN
                 self._board.tell(
-                    Cue.DISENGAGED, f"Disengaged: {reason}. The robot holds until that is over."
+                    Cue.DISENGAGED, f"Disengaged: {reason}. The robot holds until tracking returns."
                 )
             elif is_over:
                 self.disengage()
@@ -299,9 +299,9 @@ class Engagement:
         if state.fallen:
             self._refuse("Not engaged: the robot has fallen. It engages when it stands.")
         elif state.trouble:
-            self._refuse(f"Not engaged yet: {state.trouble}. Hold the gesture on.")
+            self._refuse(f"Not engaged yet: {state.trouble}. Keep holding the gesture.")
         elif not state.settled:
-            self._refuse("Not engaged yet: the robot still moves. Hold the gesture on.")
+            self._refuse("Not engaged yet: the robot still moves. Keep holding the gesture.")
         else:
             try:
                 self.engage(state, frame, poses)

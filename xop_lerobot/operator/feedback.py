@@ -154,7 +154,7 @@ def describe_hold(raised: RaisedHands, clutch: float, *, engaged: bool) -> tuple
         return HOLDING[raised.request], raised.progress
     if clutch <= 0:
         return "", 0.0
-    return f"Hold on to {'let go' if engaged else 'engage'}", clutch
+    return f"Keep holding to {'disengage' if engaged else 'engage'}", clutch
 
 
 def list_warnings(

@@ -26,9 +26,9 @@ REQUESTS = {
     "stop": RecordingRequest.STOP,
 }
 HOLDING = {
-    RecordingRequest.END: "Hold on to end the episode",
-    RecordingRequest.REDO: "Hold on to discard the episode",
-    RecordingRequest.STOP: "Hold on to stop the session",
+    RecordingRequest.END: "Keep holding to end the episode",
+    RecordingRequest.REDO: "Keep holding to discard the episode",
+    RecordingRequest.STOP: "Keep holding to stop the session",
 }
 """Text shown while a gesture is held."""
 

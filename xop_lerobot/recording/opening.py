@@ -54,7 +54,7 @@ class BatchedEncoding(XopError, ValueError):
     def __init__(self, size: int) -> None:
         super().__init__(
             f"--dataset.video_encoding_batch_size must be 1, got {size}: an episode is saved with "
-            "its videos, so that what happens later can't take them. To save sooner, use "
+            "its videos, so that a later failure cannot lose them. To save sooner, use "
             "--dataset.streaming_encoding=true"
         )
 
@@ -64,8 +64,8 @@ class NotResumable(XopError, ValueError):
 
     def __init__(self, root: object, faults: Iterable[str]) -> None:
         super().__init__(
-            f"'{root}' cannot be added to: {'; '.join(faults)}. Record as it was recorded, or "
-            "begin another --dataset.root without --resume=true"
+            f"'{root}' cannot be added to: {'; '.join(faults)}. Record with the same "
+            "settings, or start another --dataset.root without --resume=true"
         )
 
 
@@ -101,8 +101,8 @@ def find_unreadable(folder: Path, repo_id: str, error: Exception) -> BadDataset:
         fault += f"`xop-curate repair --root {folder} --out DIR` restores what is complete"
     else:
         fault = (
-            f"there is none to add to, nor is '{repo_id}' on the Hub or within reach. "
-            "Leave --resume out to begin it"
+            f"there is no dataset, and '{repo_id}' was not found on the Hub either. "
+            "Omit --resume to create it"
         )
     return BadDataset(folder, fault)
 
@@ -185,7 +185,7 @@ def _compare_names(
     if missing:
         yield f"its {column} lacks {_list_some(missing)}"
     if extra:
-        yield f"its {column} has {_list_some(extra)}, which the robot has not"
+        yield f"its {column} has {_list_some(extra)}, which the robot lacks"
 
 
 def _compare_cameras(features: Mapping[str, Mapping[str, Any]], info: RobotInfo) -> Iterator[str]:

@@ -16,7 +16,7 @@ export function formatTime(seconds) {
 export function describeState(display) {
   if (!display) return { text: 'Waiting for the robot', tone: TONE.plain };
   if (display.fallen) return { text: 'The robot has fallen', tone: TONE.bad };
-  if (display.clutch > 0) return { text: display.holding || 'Hold on', tone: TONE.warn };
+  if (display.clutch > 0) return { text: display.holding || 'Keep holding', tone: TONE.warn };
   if (display.engaged) return { text: 'Engaged: the robot follows', tone: TONE.good };
   return { text: 'Holding: nobody drives', tone: TONE.plain };
 }
