@@ -692,7 +692,7 @@ def test_a_killed_session_keeps_its_episodes(tmp_path, command, number):
         assert process.returncode == -signal.SIGKILL
     elif command == "xop-record":
         assert process.returncode == 130, errors
-        assert "stopped; the episodes that were saved stay" in errors
+        assert "interrupted; saved episodes are kept" in errors
     else:
         assert "SIGTERM: stopping; the episodes that are saved stay." in errors
     loaded = LeRobotDataset("local/toy", root=root)
