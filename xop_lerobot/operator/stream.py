@@ -24,7 +24,8 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.operator.frame import OperatorFrame
 
 MIN_STEP_TIME = 1 / 90
-"""Lower bound on the time between two frames for the motion limits, since stamps jitter [s]."""
+"""Lower bound on dt in the motion limits: however close two stamps are, the frames show moments at
+least this far apart [s]."""
 MAX_STEP_TIME = 0.04
 """Upper bound on the time for a limb's motion, however long nothing was accepted [s]."""
 MAX_BODY_TIME = 0.1

@@ -95,9 +95,9 @@ def grant(
 ) -> tuple[Cue, str]:
     """Fulfil a request of the operator, or refuse it with a reason.
 
-    During an episode, the episode ends with this control step. During the pause after it, it is not
-    saved yet, so it can still be marked or discarded. An episode in which nobody was engaged is
-    empty: it does not end on request, and is not kept if the session stops.
+    A request to end takes effect with this control step. During the pause after an episode, the
+    episode is not saved yet, so it can still be marked or discarded. An episode in which nobody was
+    engaged is empty: it does not end on request, and is not kept if the session stops.
 
     Args:
         request: The request.
