@@ -31,7 +31,6 @@ from xop_lerobot.core.pool import run_jobs
 
 if TYPE_CHECKING:
     from xop_lerobot.collect.config import CollectConfig
-    from xop_lerobot.collect.folder import Attempt, CollectFolder
     from xop_lerobot.collect.worker import Collector
 
 _TRIES = 2

@@ -69,7 +69,6 @@ def add_arguments(parser: CommandParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Inspect a dataset; returns the exit code."""
-    from xop_lerobot.curate.inspect import Table, Totals  # noqa: PLC0415
     from xop_lerobot.curate.order_check import check_whole  # noqa: PLC0415
     from xop_lerobot.curate.survey import survey  # noqa: PLC0415 SciPy, MuJoCo
 

@@ -15,7 +15,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -46,9 +46,6 @@ from xop_lerobot.recording.facts import (
     EpisodeFacts,
     compute_config_hash,
 )
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 __all__ = ["Clip", "NothingLeft", "Step", "Transferred", "transfer"]
 

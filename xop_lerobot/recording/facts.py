@@ -16,13 +16,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from xop_lerobot.core.folders import append_line, read_lines
 from xop_lerobot.core.versions import read_versions
 
 if TYPE_CHECKING:
     from xop_lerobot.recording.requests import EpisodeCounts
     from xop_lerobot.session import RobotInfo
-
-from xop_lerobot.core.folders import append_line, read_lines
 
 FACTS_DIR = Path("meta") / "xop"
 EPISODES_FILE = FACTS_DIR / "episodes.jsonl"
