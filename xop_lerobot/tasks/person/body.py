@@ -24,6 +24,8 @@ from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.tasks.person.person import Person
 
 SIDES: tuple[str, str] = ("left", "right")
+WRIST_TO_PALM = 0.1
+"""Distance from the wrist to the middle of the palm [m]."""
 OPEN, SHUT = 0.08, 0.008
 """Distance between thumb and index tip of an open hand, and in a pinch [m]."""
 PINCHES = ((0.0, 0.25), (0.45, 0.70))

@@ -14,7 +14,7 @@ from xop_lerobot.core.transforms import (
     quat_yaw,
     wrap_angle,
 )
-from xop_lerobot.tasks.person.body import SIDES, TRUNK, relaxed_hands, stand_upright
+from xop_lerobot.tasks.person.body import SIDES, TRUNK, WRIST_TO_PALM, relaxed_hands, stand_upright
 from xop_lerobot.tasks.person.grasping import (
     CARRY_SPEED,
     LIFTED,
@@ -29,7 +29,6 @@ from xop_lerobot.tasks.person.grasping import (
     open_hands,
 )
 from xop_lerobot.tasks.person.hands import (
-    HAND,
     compute_distance,
     compute_draw,
     compute_reach,
@@ -223,7 +222,7 @@ def bring_up(mind: Mind, hands: np.ndarray) -> np.ndarray:
         mind: The person.
         hands: Wrists relative to the head, along the body's heading. Shape (2, 7).
     """
-    ahead = (compute_reach(mind) + BOX_STANDOFF) / mind.belief.scale - HAND
+    ahead = (compute_reach(mind) + BOX_STANDOFF) / mind.belief.scale - WRIST_TO_PALM
     height = -mind.person.reach_low * mind.person.size
     if mind.eyes.knows("spot"):
         middle = float(mind.eyes.pose("spot")[2] + mind.eyes.size("box")[2]) + RISE_CLEARANCE

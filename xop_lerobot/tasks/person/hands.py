@@ -26,6 +26,7 @@ from xop_lerobot.tasks.person.body import (
     NECK,
     SIDES,
     TRUNK,
+    WRIST_TO_PALM,
     Posture,
     compute_sinking,
 )
@@ -51,8 +52,6 @@ SHOULDER = (-0.08, 0.18, -0.28)
 """Left shoulder relative to the eyes: forward, left, up, for eyes at 1.6 m [m]."""
 ARM = (0.30, 0.26)
 """Lengths of upper arm and forearm, for eyes at 1.6 m [m]."""
-HAND = 0.1
-"""Distance from the wrist to the middle of the palm [m]."""
 
 
 def compute_reach_time(mind: Mind, distance: float) -> float:
@@ -137,7 +136,7 @@ def compute_draw(mind: Mind, points: list[np.ndarray], farther: float = 0.0) -> 
     depth = compute_eyes(mind, points, farther) + size * up - point
     # A robot whose hands rest farther ahead than a person's is taken to have longer arms.
     longer = mind.eyes.rest_reach / (mind.belief.scale * mind.person.reach * size)
-    length = LOW_REACH * size * (sum(ARM) + HAND) * max(longer, 1.0)
+    length = LOW_REACH * size * (sum(ARM) + WRIST_TO_PALM) * max(longer, 1.0)
     farthest = size * ahead + float(np.sqrt(max(length**2 - depth**2, 0.0)))
     usual = compute_reach(mind) + mind.belief.scale * REACH_PER_SQUAT * compute_drop(mind, points)
     return max(usual + farther - mind.belief.scale * farthest, 0.0)
@@ -189,7 +188,7 @@ def is_stretched(mind: Mind, side: str, point: np.ndarray) -> bool:
     shoulder = _apply(frame, mind.person.size * _compute_shoulder(mind, side))
     reach = float(np.linalg.norm(target - shoulder))
     share = LOW_REACH if mind.body.posture.bend else STRETCHED_SHARE
-    return reach > share * mind.person.size * (sum(ARM) + HAND)
+    return reach > share * mind.person.size * (sum(ARM) + WRIST_TO_PALM)
 
 
 def _compute_shoulder(mind: Mind, side: str) -> np.ndarray:
@@ -295,8 +294,9 @@ def compute_pointing(mind: Mind, side: str, point: np.ndarray) -> np.ndarray:
     shoulder = _compute_shoulder(mind, side)
     pole = np.array([-0.2, 0.35 * left, -1.0])
     forearm = np.array([1.0, 0, 0])
-    for _ in range(5):  # fixed point: the wrist is HAND before the point, along the forearm
-        elbow = _place_elbow(shoulder, target - HAND * forearm, pole)
+    # Fixed point: the wrist lies WRIST_TO_PALM before the point, along the forearm.
+    for _ in range(5):
+        elbow = _place_elbow(shoulder, target - WRIST_TO_PALM * forearm, pole)
         forearm = _unit(target - elbow)
     outwards = np.array([0, left, 0])
     up = _unit(outwards - (outwards @ forearm) * forearm)
@@ -378,7 +378,7 @@ def tip_hands(mind: Mind, angle: float, speed: float) -> Doing:
         speed: Mean turn rate [rad/s].
     """
     room = mind.body.compute_hands_in_room()
-    palms = [pose[:3] + quat_rotate(pose[3:], np.array([HAND, 0, 0])) for pose in room]
+    palms = [pose[:3] + quat_rotate(pose[3:], np.array([WRIST_TO_PALM, 0, 0])) for pose in room]
     turn = quat_exp(angle * _unit(palms[0] - palms[1]))
     middle = (palms[0] + palms[1]) / 2
     goals = {}

@@ -21,12 +21,9 @@ from xop_lerobot.operator.display import View
 from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.tasks.person.belief import Belief
-from xop_lerobot.tasks.person.body import SIDES, Body
+from xop_lerobot.tasks.person.body import SIDES, WRIST_TO_PALM, Body
 from xop_lerobot.tasks.person.perception import Perception
 from xop_lerobot.tasks.person.person import Person, draw_person
-
-PALM = 0.1
-"""From a person's wrist to the middle of the palm [m]."""
 
 type Doing = Iterator[None]
 """An activity of the person: a generator that advances by one control tick per `next`."""
@@ -85,7 +82,9 @@ class Mind:
         side, part = name.split("_")
         own = self.body.compute_hands_in_room()[SIDES.index(side)]
         if part == "palm":
-            own = pose_multiply(own, make_pose(np.array([PALM, 0, 0]), np.array([1.0, 0, 0, 0])))
+            own = pose_multiply(
+                own, make_pose(np.array([WRIST_TO_PALM, 0, 0]), np.array([1.0, 0, 0, 0]))
+            )
         point = self.belief.point_to_robot(own[:3], self.body.compute_head())
         return make_pose(point, quat_multiply(quat_from_yaw(self.belief.turn), own[3:]))
 
