@@ -138,12 +138,12 @@ def run_motion(robot: str, name: str, noise: str, seed: int) -> Course:
             executed = loop.execute(action, teleoperation.dt)
             engaged = engaged or tick.engaged
             if engaged:
-                goals = {} if tick.goal is None else tick.goal.poses
+                wanted = {} if tick.goal is None else tick.goal.poses
                 rows.append(
                     (
                         clock,
                         state.true_qpos,
-                        *(goals.get(frame, np.full(7, np.nan)) for frame in FRAMES),
+                        *(wanted.get(frame, np.full(7, np.nan)) for frame in FRAMES),
                         executed.command,
                         int(executed.mode),
                         state.fallen,
@@ -154,7 +154,9 @@ def run_motion(robot: str, name: str, noise: str, seed: int) -> Course:
             if state.fallen:
                 break
     time, qpos, head, left, right, command, mode, fallen, trouble = zip(*rows, strict=True)
-    goals = dict(zip(FRAMES, map(np.array, (head, left, right)), strict=True))
+    goals: dict[str, np.ndarray] = {
+        name: np.array(track) for name, track in zip(FRAMES, (head, left, right), strict=True)
+    }
     return Course(
         np.array(time),
         np.array(qpos),

@@ -24,7 +24,7 @@ def test_a_person_moves_so(name):
     """From rest, without a jump, and no faster than people are."""
     motion, dt = MOTIONS[name], 0.01
     times = np.arange(0, motion.end + 1, dt)
-    frames = [motion.frame_at(time) for time in times]
+    frames = [motion.frame_at(float(time)) for time in times]
     poses = {
         part: np.array([frame.pose(part) for frame in frames])
         for part in ("head", "left_wrist", "right_wrist")
