@@ -151,6 +151,14 @@ ABLATIONS: dict[str, Ablation] = {
         "what arms miss is not made up for",
         replaced={"xop_lerobot.retarget.arms.contact:ArmBias.update": _always(None)},
     ),
+    "no_straight": Ablation(
+        "each joint at its own rate",
+        replaced={
+            "xop_lerobot.core.command:CommandSpace.straighten": lambda _stock: (
+                lambda _space, step, _missing: step
+            ),
+        },
+    ),
     "no_ess": Ablation("raw weights, λ = 0.001", {"weighting": "raw", "temperature": 0.001}),
     "gaussian": Ablation("Gaussian samples", {"sampling": "gaussian"}),
     "raw_noise": Ablation(
