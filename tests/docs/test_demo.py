@@ -100,5 +100,5 @@ def test_a_shorter_demo_is_recorded_and_shown(
     assert (tmp_path / "rby1" / "meta" / "info.json").exists()
     for suffix in ("png", "mp4", "gif"):
         assert (tmp_path / f"rby1.{suffix}").stat().st_size > 1000
-    table = capsys.readouterr().out.split("rby1.png, .mp4 and .gif")[1]
+    table = capsys.readouterr().out.split("rby1.png, .gif and .mp4")[1]
     assert "rby1" in table and " 75 " in table

@@ -200,12 +200,18 @@ class Driver:
     def compute_clearance(self, plan: Plan, distance: float) -> float:
         """Least distance to the wall while the plan is carried out [m]."""
         state, retargeter = self.loop.state, self.retargeter
-        space, previous, limited = self.morphology.command_space, state.command, []
-        for command in plan.commands:
-            previous = space.limit(command, previous, 0.02, plan.mode)
-            limited.append(previous)
+        join, count = retargeter.decision.join, len(state.command)
+        decisions = np.array([[join(command, state.arms) for command in plan.commands]])
+        executed = join(state.command, state.arms)
+        limited = retargeter.command_model.limit_rates(executed, decisions, plan.mode, 0.02)
         sensed = retargeter.rollout.predict(
-            state.qpos, state.qvel, state.memory, np.array([limited]), state.arms, plan.mode
+            state.qpos,
+            state.qvel,
+            state.memory,
+            limited[..., :count],
+            state.arms,
+            plan.mode,
+            (state.command, state.arms, state.mode),
         ).sensordata
         points = retargeter.problem.readings.read(sensed, {}).points
         self.collision.set_obstacles([make_wall(self.front + distance)])
@@ -255,7 +261,7 @@ def test_some_are_slowed_before_they_are_vetoed():
     seen = set()
     for speed in (0.3, 1.0):
         driver = Driver(speed)
-        for distance in np.linspace(0.08, 0.24, 33):
+        for distance in np.linspace(0.08, 0.4, 65):
             seen.add(Intervention(int(driver.plan(distance).health["intervention"])))
         driver.close()
     assert seen == {
