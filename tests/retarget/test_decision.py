@@ -46,6 +46,25 @@ def test_arm_joints_have_the_models_ranges_and_follow_with_a_lag(spaces, name):
 
 
 @robots
+def test_the_posture_goes_straight_and_arms_at_their_own_rates(spaces, name):
+    """An arm that has far to go slows no torso: neither do its limits when it is driven."""
+    decision, rng = spaces[name], np.random.default_rng(0)
+    space, count = decision.space, decision.num_commands
+    missing = rng.uniform(-1, 1, len(space))
+    posture = np.flatnonzero(~space.mobile_only[:count])
+    limit = 0.04 * space.max_rate
+    step = np.clip(missing, -limit, limit)
+    near, far = missing.copy(), missing.copy()
+    far[count:] *= 100
+    straight = space.straighten(step, near)
+    np.testing.assert_array_equal(straight[count:], step[count:])
+    np.testing.assert_array_equal(straight[:count], space.straighten(step, far)[:count])
+    shares = straight[posture] / missing[posture]
+    np.testing.assert_allclose(shares, np.min(np.abs(step / missing)[posture]))
+    np.testing.assert_array_equal(straight[space.mobile_only], step[space.mobile_only])
+
+
+@robots
 def test_an_empty_body_is_the_whole_command(spaces, name):
     mask = spaces[name].make_mask(())
     count = spaces[name].num_commands

@@ -44,6 +44,8 @@ class CommandDim:
             a walk too suddenly throws a robot back. None for `max_rate`.
         max_accel: Acceleration limit in teleoperation, applied by `CommandSmoother` [unit/s²];
             None for no limit.
+        alone: Whether the entry changes at its own rate instead of together with the posture, see
+            `CommandSpace.straighten`.
 
     Raises:
         BadValue: If the bounds are in the wrong order, `neutral` is not between them, or a limit
@@ -62,6 +64,7 @@ class CommandDim:
     sway_rate: float = 0.1
     stop_rate: float | None = None
     max_accel: float | None = None
+    alone: bool = False
 
     def __post_init__(self) -> None:
         if not self.low <= self.neutral <= self.high:
@@ -281,7 +284,7 @@ class CommandSpace:
     def straighten(self, step: np.ndarray, missing: np.ndarray) -> np.ndarray:
         r"""Shorten steps so that a posture changes along a straight line.
 
-        All entries but velocities move by one share of what they miss,
+        All entries but velocities and those that are `alone` move by one share of what they miss,
         :math:`s = \min_i |\delta_i| / |\Delta_i|`, and so arrive together. With each at its own
         rate, quick joints of a chain run ahead of slow ones: between two postures that have the
         head in the same place it would go a long way round.
@@ -294,10 +297,15 @@ class CommandSpace:
             The steps, none of them longer. Shape (..., k).
         """
         size, distance = np.abs(step), np.abs(missing)
-        counts = ~self.mobile_only & (distance > 1e-12)
+        counts = ~self._apart & (distance > 1e-12)
         shares = np.divide(size, distance, out=np.ones_like(size), where=counts)
         share = shares.min(axis=-1, keepdims=True, initial=1.0)
-        return np.where(self.mobile_only, step, share * missing)
+        return np.where(self._apart, step, share * missing)
+
+    @cached_property
+    def _apart(self) -> np.ndarray:
+        """Which entries change at their own rates. Shape (k,), bool."""
+        return self.mobile_only | np.array([dim.alone for dim in self.dims], dtype=bool)
 
     def index(self, name: str) -> int:
         """Return the index of `name`.

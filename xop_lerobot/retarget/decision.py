@@ -39,9 +39,9 @@ class DecisionSpace:
             joint = model.joint(name)
             low, high = joint.range if model.jnt_limited[joint.id] else (-np.pi, np.pi)
             rest = morphology.arm_rest.get(name, 0.0)
-            dims.append(
-                CommandDim(name, f"{name}.pos", "rad", low, high, rest, max_rate=ARM_MAX_RATE)
-            )
+            key = f"{name}.pos"
+            # Arms are not part of the posture: `limit_action` limits each of their joints.
+            dims.append(CommandDim(name, key, "rad", low, high, rest, ARM_MAX_RATE, alone=True))
         self.num_commands = len(morphology.command_space)
         self.space = morphology.command_space.extend(tuple(dims))
         arm_effects = (
