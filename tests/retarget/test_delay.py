@@ -239,11 +239,11 @@ def follow(robot: str, delay: float, seed: int = 0, seconds: float = 5.0, *, com
 
 @pytest.mark.slow
 def test_with_a_delay_of_100_ms_compensation_tracks_better():
-    """A walking G1: 8.1 cm of error become 7.7 over eight seeds; one of them is even."""
+    """A walking G1: 8.1 cm of error become 7.7, less with every seed."""
     plain = [follow("g1", 0.1, seed, compensate=False)[0] for seed in range(8)]
     ahead = [follow("g1", 0.1, seed, compensate=True)[0] for seed in range(8)]
     assert np.mean(ahead) < 0.96 * np.mean(plain)
-    assert sum(np.less(ahead, plain)) >= 7
+    assert all(np.less(ahead, plain))
 
 
 def test_plans_of_a_slow_planner_are_used_at_their_time():

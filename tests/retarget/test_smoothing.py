@@ -157,20 +157,24 @@ def test_single_precision_of_the_action_does_not_upset_it():
     space, rest = morphology.command_space, morphology.rest_action()
     smoother = CommandSmoother(space, 0.04)
     action = RobotAction(rest.command.astype(np.float32).astype(float), rest.mode, rest.arms)
-    steps = []
+    befores, steps = [], []
     for _ in range(6):
         sent, _ = smoother.smooth(space.high, Mode.MOBILE, action.command, action.mode)
         wanted = RobotAction(sent, Mode.MOBILE, action.arms)
         after = limit_action(morphology, wanted, action, 0.04)
         smoother.note(action.command, after.command)
+        befores.append(action.command)
         steps.append(after.command - action.command)
         action = after
-    first = np.minimum(space.max_accel * 0.04**2, steps[1])
-    np.testing.assert_allclose(steps[0], first, rtol=0.01)
+    gain = space.max_accel * 0.04**2
+    for before, step, limit in ((befores[0], steps[0], gain), (befores[-1], steps[-1], np.inf)):
+        missing = space.high - before
+        rate = np.minimum(space.max_rate * 0.04, compute_braking_step(missing, gain))
+        expected = np.minimum(space.straighten(rate, missing), limit)
+        np.testing.assert_allclose(step, expected, rtol=1e-5)
     # Velocities change at their own rates, the posture as fast as its slowest joint allows.
-    velocities = space.mobile_only
-    np.testing.assert_allclose(steps[-1][velocities], space.max_rate[velocities] * 0.04, rtol=1e-4)
-    share = steps[-1] / (space.max_rate * 0.04)
+    velocities, share = space.mobile_only, steps[-1] / (space.max_rate * 0.04)
+    np.testing.assert_allclose(share[velocities], 1.0, rtol=1e-4)
     assert share[~velocities].max() == pytest.approx(1.0, rel=1e-4)
 
 

@@ -46,12 +46,14 @@ def _make_conservative(
     """Smoother and slower motion; plays the role of the paper's w_a = 0.5.
 
     The paper's control energy weighs the absolute command, which would pull a standing height
-    down. Here changes of the command cost instead, the proposal is slower, and the samples stay
-    closer to the plan.
+    down. Here changes of the command cost instead, the proposal is slower, the samples stay closer
+    to the plan, and it is the mean of more of them: with few, a costly change comes in jerks.
     """
     del morphology, paper
-    weights = dataclasses.replace(config.weights, control=2.0, change=0.5)
-    return _scale_pace(dataclasses.replace(config, weights=weights), time=2.0, noise=0.5)
+    weights = dataclasses.replace(config.weights, control=0.5, change=0.8)
+    many = 2.5 * config.effective_samples
+    config = dataclasses.replace(config, weights=weights, effective_samples=many)
+    return _scale_pace(config, time=2.0, noise=0.3)
 
 
 def _make_aggressive(
