@@ -462,18 +462,18 @@ def test_lateral_is_the_angle_to_where_the_base_shall_face(share):
     ],
 )
 def test_where_a_base_on_wheels_shall_face(heading, velocity, look, facing):
-    x, y = compute_facing(heading, np.array(velocity), look, speed=1.0)
+    x, y = compute_facing(heading, np.array(velocity), look, speed=1.0, max_twist=1.9)
     assert math.atan2(y, x) == pytest.approx(facing, abs=0.01)
     assert math.hypot(x, y) == pytest.approx(1)
     # All of it turns with the world.
     turned = quat_rotate(quat_from_yaw(0.5), np.array([*velocity, 0.0]))[:2]
-    x, y = compute_facing(heading + 0.5, turned, look + 0.5, speed=1.0)
+    x, y = compute_facing(heading + 0.5, turned, look + 0.5, speed=1.0, max_twist=1.9)
     assert math.atan2(y, x) == pytest.approx(facing + 0.5, abs=0.01)
 
 
 def test_the_last_centimetres_are_left_to_the_waist():
     lengths = [
-        np.hypot(*compute_facing(0.0, np.array([0.3, 0.3]), 0.0, speed))
+        np.hypot(*compute_facing(0.0, np.array([0.3, 0.3]), 0.0, speed, 1.9))
         for speed in (0.0, 0.08, 0.14, 0.2, 2.0)
     ]
     np.testing.assert_allclose(lengths, [0, 0, 0.5, 1, 1])

@@ -12,6 +12,15 @@ from xop_lerobot.core.state import Goal
 from xop_lerobot.core.transforms import make_pose, quat_multiply
 from xop_lerobot.retarget.costs.tracking import make_level
 
+STILL = 0.1
+"""Horizontal speed up to which a goal counts as stationary [m/s]."""
+
+
+def is_moving(goal: Goal, name: str) -> bool:
+    """Whether the goal of a tracked frame moves horizontally."""
+    velocity = goal.velocities.get(name)
+    return velocity is not None and math.hypot(velocity[0], velocity[1]) > STILL
+
 
 def hold_near(goal: Goal, poses: Mapping[str, np.ndarray], reach: float) -> Goal:
     """Limit the horizontal distance of goals from their frames to `reach`.

@@ -30,6 +30,7 @@ from xop_lerobot.core.transforms import (
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.costs.balance import SupportArea
+from xop_lerobot.retarget.horizon_goals import is_moving
 from xop_lerobot.retarget.model.command_model import (
     CommandModel,
     PlannerState,
@@ -47,7 +48,6 @@ _EFFORT, _LEVEL_EFFORT = 0.002, 0.01
 _NEAR, _SAME = 0.01, 0.03  # error of the posture up to which the goal is not corrected [m], [rad]
 _EXTEND = 0.02  # change of the reach of a standing robot per solve [m]
 _FARTHEST = 1.0  # its upper bound [m]
-_STILL = 0.1  # speed below which a goal counts as stationary [m/s]
 _OFF, _PATIENCE = 0.06, 25  # height error [m] and number of solves that make a robot stuck
 _CREEP = 0.02  # tolerance on velocities that count as zero [m/s], [rad/s]
 _BEYOND = 0.6  # hysteresis: angle past half a turn at which the waist changes sides [rad]
@@ -232,7 +232,7 @@ class PostureGuide:
         if beyond and not reachable:  # a tilted head may exceed the waist's range and be reachable
             pose[3:] = quat_multiply(quat_from_yaw(-beyond), pose[3:])
             reachable = self._free.find(HEAD, state, pose).missed <= MISSED
-        self._adapt_reach(reachable and is_far, moving=_is_moving(goal))
+        self._adapt_reach(reachable and is_far, moving=is_moving(goal, HEAD))
         if is_far:
             # A robot that bows or squats moves its head forward. So the reach counts from the line
             # between the head at rest and the head in the posture for the goal's height and tilt.
@@ -258,7 +258,7 @@ class PostureGuide:
 
         Latched until the goal moves.
         """
-        if _is_moving(goal):
+        if is_moving(goal, HEAD):
             self._waited = 0
         elif self._waited < _PATIENCE:
             poses, _, _ = self._placement.compute(qpos[None])
@@ -336,12 +336,6 @@ class PostureGuide:
         )
         poses, _, com = self._placement.compute(future[None])
         return poses[self._site][0], com[0]
-
-
-def _is_moving(goal: Goal) -> bool:
-    """Whether the goal of the head moves horizontally."""
-    velocity = goal.velocities.get(HEAD)
-    return velocity is not None and math.hypot(velocity[0], velocity[1]) > _STILL
 
 
 def _remove_roll(pose: np.ndarray) -> np.ndarray:

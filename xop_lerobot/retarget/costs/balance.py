@@ -261,13 +261,16 @@ def _compute_upright(base: np.ndarray) -> np.ndarray:
 
 _LOOKING = 0.1  # u_0: speed at which direction of travel and goal heading weigh the same [m/s]
 _REST, _FULL = 0.08, 0.2  # speeds between which the weight of the heading grows from 0 to 1 [m/s]
-_TWIST = 0.3  # cost of a waist twist relative to a turn of the base [1]
-_BACKWARDS = 0.2  # turn up to which turning is preferred to driving backwards [rad]
-_MAX_TWIST = 1.9  # largest desired twist of the waist [rad]
+TWIST_COST = 0.3
+"""Cost of a waist twist relative to a turn of the base [1]."""
+BACKWARDS_COST = 0.2
+"""Turn up to which turning is preferred to driving backwards [rad]."""
 _TOO_TWISTED = 10.0  # cost of a twist beyond it, relative to a turn [1]
 
 
-def compute_facing(heading: float, velocity: np.ndarray, look: float, speed: float) -> np.ndarray:
+def compute_facing(
+    heading: float, velocity: np.ndarray, look: float, speed: float, max_twist: float
+) -> np.ndarray:
     r"""Compute the desired heading of a wheeled base, and its weight.
 
     .. math:: \psi^\pm = \angle(\pm u + u_0\,(\cos\psi_g, \sin\psi_g))
@@ -285,18 +288,19 @@ def compute_facing(heading: float, velocity: np.ndarray, look: float, speed: flo
         velocity: The axle's velocity u [m/s]. Shape (2,).
         look: Heading of the goal [rad].
         speed: Speed with which the tracked frame would reach its goal in time [m/s].
+        max_twist: Largest desired twist of the waist [rad].
 
     Returns:
         Direction in the world, whose length is the weight, 0 to 1. Shape (2,).
     """
     ahead = _LOOKING * np.array([math.cos(look), math.sin(look)])
     best, least = look, math.inf
-    for sign, effort in ((1.0, 0.0), (-1.0, _BACKWARDS)):
+    for sign, effort in ((1.0, 0.0), (-1.0, BACKWARDS_COST)):
         x, y = sign * velocity + ahead
         facing = math.atan2(y, x)
         effort += abs(float(wrap_angle(facing - heading)))  # noqa: PLW2901
         twist = abs(float(wrap_angle(facing - look)))
-        effort += _TWIST * twist + _TOO_TWISTED * max(twist - _MAX_TWIST, 0.0)  # noqa: PLW2901
+        effort += TWIST_COST * twist + _TOO_TWISTED * max(twist - max_twist, 0.0)  # noqa: PLW2901
         if effort < least:
             best, least = facing, effort
     share = min(max((speed - _REST) / (_FULL - _REST), 0.0), 1.0)

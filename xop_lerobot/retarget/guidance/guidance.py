@@ -20,7 +20,7 @@ from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.costs.balance import compute_facing
 from xop_lerobot.retarget.guidance.route import Footprint, RoutePlanner
-from xop_lerobot.retarget.horizon_goals import hold_near, preview
+from xop_lerobot.retarget.horizon_goals import hold_near, is_moving, preview
 from xop_lerobot.retarget.model.command_model import CommandModel, PlannerState
 from xop_lerobot.retarget.posture_guide import HEAD, Served
 
@@ -35,6 +35,7 @@ class FacingRule:
 
     def __init__(self, morphology: Morphology, resting: Mapping[str, float]) -> None:
         self._pivot, self._resting = morphology.pivot, dict(resting)
+        self._max_twist = morphology.driving.arrival_twist if morphology.driving else math.pi
         self._hands = {arm.frame for arm in morphology.arms}
 
     def compute(
@@ -69,7 +70,7 @@ class FacingRule:
                 end = goals[0, :2] + (pivot - resting) * _direction(look)
                 velocity = (end - qpos[:2] - pivot * _direction(heading)) / dt
             speed = float(np.hypot(*missing)) / dt
-            return compute_facing(heading, velocity, look, speed)
+            return compute_facing(heading, velocity, look, speed, self._max_twist)
         return np.zeros(2)
 
 
@@ -92,7 +93,6 @@ def find_waist_axis(morphology: Morphology, model: mujoco.MjModel) -> float:
 
 
 _LOOK_AHEAD = 1.6  # least duration of a simulated path: about a quarter turn [s]
-_STILL = 0.1  # speed below which a goal counts as stationary [m/s]
 
 
 class Guidance:
@@ -149,7 +149,7 @@ class Guidance:
         ahead = {} if served is None else {HEAD: served.ahead}
         name = next((name for name in poses if name in goal.poses), None)
         drives = name is not None and self._drives(goal.mode)
-        if name is not None and drives and _compute_speed(goal, name) < _STILL:
+        if name is not None and drives and not is_moving(goal, name):
             return self._lead_along_route(state, goal, name, times, config, ahead)
         near = hold_near(goal, poses, config.reach)
         goals = preview(near, tuple(poses), times, config.preview_s)
@@ -207,9 +207,3 @@ def compute_times(config: MpcConfig) -> np.ndarray:
     end = config.horizon * POLICY_DT
     steps = np.arange(config.horizon + 1) * POLICY_DT
     return np.append(steps, [end + config.extrapolation_s, config.proposal_s])
-
-
-def _compute_speed(goal: Goal, name: str) -> float:
-    """Horizontal speed of a goal [m/s]."""
-    velocity = goal.velocities.get(name)
-    return 0.0 if velocity is None else math.hypot(velocity[0], velocity[1])

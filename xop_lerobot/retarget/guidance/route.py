@@ -17,6 +17,7 @@ import numpy as np
 from xop_lerobot.core.transforms import compute_heading, quat_yaw
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import Driving
+from xop_lerobot.retarget.costs.balance import BACKWARDS_COST, TWIST_COST
 from xop_lerobot.retarget.obstacles import Obstacle, ObstacleSet
 
 
@@ -72,8 +73,6 @@ class Footprint:
 _DT = 0.04  # time step of the simulated path [s]
 _FINE = 6.0  # proportional gain near the goal, where the braking law is too steep [1/s]
 _FINE_DRIVE, _FINE_TURN = 0.05, 0.1  # distances within which that gain applies [m], [rad]
-_BACKWARDS = 0.2  # turn up to which turning is preferred to driving backwards [rad]
-_TWIST = 0.3  # cost of a waist twist relative to a turn of the base [1]
 _RESTING, _TURNING = 0.15, 0.45  # yaw rates of a goal at rest and of a turning one [rad/s]
 _TWIST_RAMP = 0.3  # excess twist over which the weight of the heading grows to 1 [rad]
 _CLOSE = 0.12  # distance from its goal position at which the axle no longer turns towards it [m]
@@ -343,8 +342,8 @@ def _face(
         ahead, aside = _rotate(_LINE_UP, 0.0, end)
         facing = math.atan2(sign * dy + aside, sign * dx + ahead)
     turn = _wrap(facing - heading)
-    effort = abs(turn) + abs(_wrap(end - facing)) + _TWIST * abs(_wrap(end - aim.look))
-    return effort + (_BACKWARDS if sign < 0 else 0.0), turn, dx, dy
+    effort = abs(turn) + abs(_wrap(end - facing)) + TWIST_COST * abs(_wrap(end - aim.look))
+    return effort + (BACKWARDS_COST if sign < 0 else 0.0), turn, dx, dy
 
 
 def _brake(distance: float, deceleration: float, fine: float) -> float:
