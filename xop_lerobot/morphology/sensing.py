@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 def add_sensing(spec: mujoco.MjSpec, morphology: Morphology) -> None:
     """Add the sensors that `Sensing` reads to a robot's planning model.
 
-    Poses of the tracked frames, positions of the contact and hull points, velocities of the
-    contact points, and the centre of mass. They cost almost nothing in the physics, while forward
+    Poses of the tracked frames, positions of the contact and hull points, and velocities of the
+    contact points. They cost almost nothing in the physics, while forward
     kinematics of all predicted states would cost about a tenth of it.
     """
     import mujoco  # noqa: PLC0415
@@ -37,12 +37,6 @@ def add_sensing(spec: mujoco.MjSpec, morphology: Morphology) -> None:
             spec.add_sensor(
                 name=f"{label}:{site}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
             )
-    spec.add_sensor(
-        name="com",
-        type=kinds.mjSENS_SUBTREECOM,
-        objtype=mujoco.mjtObj.mjOBJ_BODY,
-        objname=morphology.base_body,
-    )
 
 
 class Sensing:
@@ -79,7 +73,3 @@ class Sensing:
     def read_velocity(self, sensordata: np.ndarray, site: str) -> np.ndarray:
         """World velocity of a contact point's site [m/s]. Shape (..., 3)."""
         return self._read(sensordata, f"velocity:{site}")
-
-    def read_com(self, sensordata: np.ndarray) -> np.ndarray:
-        """Centre of mass of the whole robot in the world [m]. Shape (..., 3)."""
-        return self._read(sensordata, "com")

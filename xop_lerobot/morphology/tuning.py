@@ -33,7 +33,7 @@ class CostWeights:
         control: w_a, squared deviation of the command from its reference, in half ranges [1].
         change: Squared change of the command from the executed one, in half ranges [1].
         terminal: w_f, factor on the tracking cost at the end of the extrapolation [1].
-        support: Squared distance of the zero-moment point beyond the safe support area [1/m²].
+        support: Squared distance of the centre of mass beyond the safe support area [1/m²].
         lean: Squared distance of the centre of mass from its rest position on the base [1/m²].
         load: Squared static torque of a joint beyond its allowed share of the motor limit [1].
         lateral: Squared heading error of a wheeled base [1/rad²].

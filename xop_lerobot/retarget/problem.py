@@ -190,7 +190,6 @@ class Problem:
             poses=read.poses,
             points=read.points,
             velocities=read.velocities,
-            com=read.com,
             terminal_qpos=extrapolated,
             terminal_poses=then.poses,
             terminal_points=then.points,

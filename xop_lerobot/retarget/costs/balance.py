@@ -16,9 +16,6 @@ from xop_lerobot.morphology.contacts import ContactKind
 from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 from xop_lerobot.retarget.static_load import StaticLoad
 
-GRAVITY = 9.81  # [m/s²]
-_VELOCITY_STEPS = 3  # control steps at the end of the horizon over which the velocity is averaged
-
 
 class SupportArea:
     """Convex support area of a robot, shrunk by a margin.
@@ -47,11 +44,7 @@ class SupportArea:
 
     def compute_excess(self, base: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Distance of points beyond each edge, 0 inside [m]. (..., 7), (..., 2) -> (..., c)."""
-        return self.compute_excess_in_base(_to_base(base, points))
-
-    def compute_excess_in_base(self, places: np.ndarray) -> np.ndarray:
-        """`compute_excess` of points in the base's frame [m]. (..., 2) -> (..., c)."""
-        return np.maximum(places @ self._normals.T - self._offsets, 0)
+        return np.maximum(_to_base(base, points) @ self._normals.T - self._offsets, 0)
 
     def compute_lean(
         self, base: np.ndarray, com: np.ndarray, balance: np.ndarray | None = None
@@ -104,20 +97,10 @@ def _to_base(base: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 class SupportCost(Cost):
-    r"""Squared distances beyond the shrunk support area, of three points.
+    r"""Squared distance of the centre of mass beyond the shrunk support area, lean and load.
 
-    .. math::
-
-        z = c_{xy} - \frac{c_z}{g}\,\ddot c_{xy}, \qquad
-        \xi = c_{xy} + \sqrt{c_z / g}\;\dot c_{xy}
-
-    with c the centre of mass and its acceleration the mean over the horizon, from finite
-    differences. On flat ground the robot tips when the zero-moment point z leaves the area
-    (Vukobratović and Borovac, 2004). The horizon is too short to show that a robot has begun to
-    tip, so the capture point ξ at its end, with the velocity relative to the base, counts too: the
-    point over which the centre of mass would come to rest (Pratt et al., 2006). The third point is
-    the centre of mass at the end of the extrapolation, where the robot must be able to stand
-    still. Two terms are added there: the squared distance of the centre of mass from its rest
+    All at the end of the extrapolation, where the robot must be able to stand still: the centre of
+    mass over the support area, with the weight `support`; its squared distance from its rest
     position beyond a free circle, with the weight `lean`, so that a mobile robot drives to its
     goal instead of bending; and the squared static torques beyond their allowed share of the motor
     limits, with the weight `load`, since a torso whose servos give way folds. Not in the paper.
@@ -140,29 +123,10 @@ class SupportCost(Cost):
             loaded = evaluation.weights.load * sum_squares(beyond)
         if self.area is None:
             return loaded
-        com, dt = evaluation.com[:, 1:], evaluation.dt
-        velocity = np.diff(com[..., :2], axis=1) / dt
-        acceleration = np.zeros((len(com), 2))  # unknown from fewer than two velocities
-        if velocity.shape[1] > 1:
-            span = (velocity.shape[1] - 1) * dt
-            acceleration = (velocity[:, -1] - velocity[:, 0]) / span
-        zmp = com[..., :2] - com[..., 2:] / GRAVITY * acceleration[:, None]
-        excess = sum_squares(self.area.compute_excess(evaluation.qpos[:, 1:, :7], zmp))
-        excess = excess.mean(-1) + sum_squares(self._compute_capture_excess(evaluation))
         base, com = evaluation.terminal_qpos[:, :7], evaluation.terminal_com[:, :2]
-        excess += sum_squares(self.area.compute_excess(base, com))
+        excess = sum_squares(self.area.compute_excess(base, com))
         lean = sum_squares(self.area.compute_lean(base, com, evaluation.balance))
         return evaluation.weights.support * excess + evaluation.weights.lean * lean + loaded
-
-    def _compute_capture_excess(self, evaluation: Evaluation) -> np.ndarray:
-        """Distance of the capture point beyond each edge at the end of the horizon. (K, c)."""
-        assert self.area is not None
-        steps = min(_VELOCITY_STEPS, evaluation.com.shape[1] - 1)
-        com, base = evaluation.com[:, -1 - steps :], evaluation.qpos[:, -1 - steps :, :7]
-        place = _to_base(base, com[..., :2])
-        velocity = (place[:, -1] - place[:, 0]) / (steps * evaluation.dt)
-        capture = place[:, -1] + np.sqrt(np.maximum(com[:, -1, 2:], 0) / GRAVITY) * velocity
-        return self.area.compute_excess_in_base(capture)
 
 
 class StanceCost(Cost):

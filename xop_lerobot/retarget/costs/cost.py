@@ -28,7 +28,6 @@ class Evaluation:
         points: Predicted position of contact and hull sites. Shapes (K, H + 1, 3).
         velocities: Predicted velocity of contact sites [m/s]. Shapes (K, H + 1, 3).
         terminal_points: Position of those sites at the end of the extrapolation. Shapes (K, 3).
-        com: Predicted centre of mass, of robots with a support area. Shape (K, H + 1, 3).
         terminal_qpos: Position at the end of the extrapolation. Shape (K, nq).
         terminal_com: Centre of mass at that time, of robots with a support area. Shape (K, 3).
         goals: Goal of each tracked frame at every step. Shapes (H + 1, 7).
@@ -54,7 +53,6 @@ class Evaluation:
     points: Mapping[str, np.ndarray]
     velocities: Mapping[str, np.ndarray]
     terminal_points: Mapping[str, np.ndarray]
-    com: np.ndarray
     terminal_qpos: np.ndarray
     terminal_com: np.ndarray
     goals: Mapping[str, np.ndarray]

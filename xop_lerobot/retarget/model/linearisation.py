@@ -148,7 +148,8 @@ class Parts(NamedTuple):
         poses: Pose of each tracked frame. Shapes (..., 7).
         points: Position of contact and hull sites [m]. Shapes (..., 3).
         velocities: Velocity of contact sites [m/s]; only in rollouts. Shapes (..., 3).
-        com: Centre of mass [m]; empty for a robot without a support area. Shape (..., 3).
+        com: Centre of mass [m]; empty in rollouts and for a robot without a support area.
+            Shape (..., 3).
     """
 
     poses: Mapping[str, np.ndarray]
@@ -205,5 +206,5 @@ class Readings:
                 for site in (*self._contacts, *self._hull)
             },
             {site: sensing.read_velocity(sensordata, site) for site in self._contacts},
-            sensing.read_com(sensordata) if self._com_of else np.zeros(0),
+            np.zeros(0),
         )
