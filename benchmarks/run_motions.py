@@ -39,7 +39,6 @@ from xop_lerobot.core.state import FRAMES
 from xop_lerobot.core.transforms import quat_rotate
 from xop_lerobot.evaluation.trial import closed_loop
 from xop_lerobot.evaluation.trial_metrics import compute_feet
-from xop_lerobot.morphology.effect import Acts
 from xop_lerobot.morphology.morphology import Morphology, list_robots, make_morphology, say_robots
 from xop_lerobot.operator.devices.config import DeviceConfig
 from xop_lerobot.operator.devices.replay import Player
@@ -47,6 +46,7 @@ from xop_lerobot.operator.frame import OperatorFrame
 from xop_lerobot.operator.noise import HumanNoise
 from xop_lerobot.plant.config import SimulationConfig
 from xop_lerobot.plant.simulation import Simulation
+from xop_lerobot.plant.watch import find_load_bearing
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.session import Tick
 from xop_lerobot.teleoperation import TeleoperationConfig
@@ -232,16 +232,11 @@ def _reduce(reduce: Any, values: Any) -> float | None:
 
 
 def _compute_gap(morphology: Morphology, course: Course) -> float:
-    """Largest distance of a stiff servo of the body behind its target [rad]."""
+    """Largest distance of a stiff servo of the posture behind its target [rad]."""
     if morphology.servos is None:
         return 0.0
     model = morphology.build_spec("planning").compile()
-    joints = [
-        (i, int(model.joint(effect.joint).qposadr[0]))
-        for i, effect in enumerate(morphology.effects)
-        if effect.acts is Acts.JOINT
-    ]
-    columns, addresses = (list(each) for each in zip(*joints, strict=True))
+    columns, addresses = find_load_bearing(morphology, model)
     return float(np.abs(course.command[:, columns] - course.qpos[:, addresses]).max())
 
 

@@ -109,7 +109,7 @@ REFUSALS = {
     "{}": "a change must change something: preset, weights, variant,",
     '{"mode": 1}': "mode must be a name, got 1",
     '{"targets": []}': "there must be a target: head, left_wrist, right_wrist",
-    '{"body": ["tail"]}': "unknown part of the body 'tail'. Known: left_arm_0,",
+    '{"body": ["tail"]}': "unknown part of the body 'tail'. Known: head_0, head_1,",
     '{"toggle": "lights"}': "unknown constraint or preset 'lights'. Known: aggressive,",
     '{"get": "weather"}': "'get' must be 'settings', got 'weather'",
     '{"get": "settings", "mode": "mobile"}': (

@@ -721,15 +721,16 @@ def test_rby1_drives_as_commanded() -> None:
 
 
 def test_diff_drive_maps_by_name_and_clips() -> None:
-    """Torso and arm targets reach the actuator of their name, within its range; the head is 0."""
+    """Torso, neck and arm targets reach the actuator of their name, within its range."""
     morphology, policy = make_morphology("rby1"), DiffDrive()
     model = build_model(morphology, "planning")
     qpos, qvel, command, arms, memory = make_inputs(policy, 1)
-    command[0, morphology.command_space.index("torso_1")] = 9.0
+    for joint, target in (("torso_1", 9.0), ("head_0", -0.4), ("head_1", 0.3)):
+        command[0, morphology.command_space.index(joint)] = target
     targets = policy.act(qpos, qvel, command, arms, memory, Mode.MOBILE).targets[0]
     named = {model.actuator(i).name: targets[i] for i in range(model.nu)}
     assert named["torso_1"] == model.actuator("torso_1").ctrlrange[1]
-    assert named["head_0"] == named["head_1"] == 0
+    assert (named["head_0"], named["head_1"]) == (-0.4, 0.3)
     for name, value in zip(morphology.arm_names, arms[0], strict=True):
         low, high = model.actuator(name).ctrlrange
         assert named[name] == np.clip(value, low, high)

@@ -411,7 +411,7 @@ class TestRby1M:
         assert np.linalg.norm(data.qpos[:2]) < 1e-4
         assert abs(quat_yaw(data.qpos[3:7])) < 1e-4
         assert np.abs(data.qvel).max() < 1e-3
-        torso = make_morphology("rby1m").command_space.neutral[3:]
+        torso = make_morphology("rby1m").command_space.neutral[3:9]
         assert np.abs(data.qpos[7:13] - torso).max() < 0.005
 
     def test_wheel_speeds_are_those_of_the_motors(self) -> None:

@@ -9,6 +9,13 @@ import pytest
 
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.state import Goal
+from xop_lerobot.core.transforms import (
+    make_pose,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    rotation_error,
+)
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.scene import build_model
@@ -49,10 +56,7 @@ class Bench:
             }
         )
         self.retargeter.reset(self.loop.state)
-        sites = {"head": self.morphology.frames["head"]}
-        self.head = self.retargeter.problem.readings.compute_poses(self.loop.state.qpos, sites)[
-            "head"
-        ]
+        self.head = self.compute_head(self.loop.state.qpos)
         self.sampled: list[Samples] = []
         self.costs: list[np.ndarray] = []
         self.evaluations: list = []
@@ -81,6 +85,10 @@ class Bench:
             return self.evaluations[-1]
 
         self.retargeter.problem.evaluate = watched  # type: ignore[method-assign]
+
+    def compute_head(self, qpos: np.ndarray) -> np.ndarray:
+        sites = {"head": self.morphology.frames["head"]}
+        return self.retargeter.problem.readings.compute_poses(qpos, sites)["head"]
 
     def make_goal(self, mode: Mode, offset=(0.25, 0.05, -0.05)) -> Goal:
         pose = self.head.copy()
@@ -130,7 +138,8 @@ def test_every_candidate_is_among_the_samples(bench, name, mode):
     count = retargeter.decision.num_commands
     executed = retargeter.decision.join(state.command, state.arms)
     velocities = retargeter.command_model.is_velocity()
-    acting = retargeter.command_model.acting(mode)
+    neck = retargeter.command_model.neck
+    acting = retargeter.command_model.acting(mode) & ~neck
     held = np.where(velocities, 0.0, executed)
     held[:count] = space.neutral[:count]
     proposal = b.evaluations[-1].reference  # control_reference is the proposal
@@ -147,6 +156,46 @@ def test_every_candidate_is_among_the_samples(bench, name, mode):
     stop = np.where(velocities, 0.0, executed)
     np.testing.assert_allclose(commands[5, 0][acting], stop[acting], atol=1e-12)
     assert len(np.unique(commands[1:6, 0].round(9), axis=0)) >= 4  # they do differ
+    tried = b.evaluations[-1].commands  # a neck is not sampled
+    np.testing.assert_array_equal(
+        tried[..., neck], np.broadcast_to(proposal[neck], (10, 4, neck.sum()))
+    )
+
+
+@modes
+@pytest.mark.parametrize("yaw, pitch", [(0.5, 0.0), (0.0, 0.6), (-0.4, 0.4), (0.0, -0.5)])
+def test_a_neck_takes_what_is_too_quick_for_the_chest(bench, mode, yaw, pitch):
+    """The plan turns the head within 0.2 s, in which the chest turns by 0.24 rad at most."""
+    b = bench("rby1", candidates=("proposal",))
+    turn = quat_multiply(quat_from_yaw(yaw), quat_from_rpy(0.0, pitch, 0.0))
+    head = make_pose(b.head[:3], quat_multiply(turn, b.head[3:]))
+    for _ in range(5):
+        plan = b.retargeter.plan(b.loop.state, Goal({"head": head}, mode=mode))
+        b.loop.execute(RobotAction(plan.command, mode, b.loop.action.arms), DT)
+    reached = b.compute_head(b.loop.state.qpos)
+    assert np.linalg.norm(rotation_error(head[3:], reached[3:])) < 0.2
+    assert np.linalg.norm(reached[:3] - head[:3]) < 0.08  # eyes are 8 cm from the neck's axes
+    neck = [name.startswith("head") for name in b.morphology.command_space.names]
+    assert np.abs(b.loop.state.command[neck]).max() > 0.1
+
+
+def test_a_neck_turns_back_from_a_chest_that_is_slower(bench):
+    """A head that looks ahead again, with the chest turned by 0.6 rad."""
+    b = bench("rby1", candidates=("proposal",))
+    space = b.morphology.command_space
+    turned = space.neutral.copy()
+    turned[space.index("torso_5")] = 0.6
+    for _ in range(30):
+        b.loop.execute(RobotAction(turned, Mode.STATIONARY, b.loop.action.arms), DT)
+    b.retargeter.reset(b.loop.state)
+    for _ in range(6):
+        plan = b.retargeter.plan(b.loop.state, Goal({"head": b.head}, mode=Mode.STATIONARY))
+        b.loop.execute(RobotAction(plan.command, Mode.STATIONARY, b.loop.action.arms), DT)
+    command = b.loop.state.command
+    assert command[space.index("torso_5")] > 0.25
+    assert command[space.index("head_0")] < -0.2
+    reached = b.compute_head(b.loop.state.qpos)
+    assert np.linalg.norm(rotation_error(b.head[3:], reached[3:])) < 0.1
 
 
 @robots

@@ -12,7 +12,7 @@ from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.retarget.arms.ik import ARM_MAX_RATE
 from xop_lerobot.retarget.decision import ARM_LAG_S, DecisionSpace
 
-ROBOTS = {"g1": 7 + 14, "rby1": 8 + 14}
+ROBOTS = {"g1": 7 + 14, "rby1": 10 + 14}
 robots = pytest.mark.parametrize("name", list(ROBOTS))
 
 
@@ -46,19 +46,21 @@ def test_arm_joints_have_the_models_ranges_and_follow_with_a_lag(spaces, name):
 
 
 @robots
-def test_the_posture_goes_straight_and_arms_at_their_own_rates(spaces, name):
-    """An arm that has far to go slows no torso: neither do its limits when it is driven."""
+def test_the_posture_goes_straight_and_neck_and_arms_at_their_own_rates(spaces, name):
+    """An arm or a neck that has far to go slows no torso."""
     decision, rng = spaces[name], np.random.default_rng(0)
     space, count = decision.space, decision.num_commands
     missing = rng.uniform(-1, 1, len(space))
-    posture = np.flatnonzero(~space.mobile_only[:count])
+    alone = np.array([dim.alone for dim in space.dims])
+    posture = np.flatnonzero(~(space.mobile_only | alone))
     limit = 0.04 * space.max_rate
     step = np.clip(missing, -limit, limit)
     near, far = missing.copy(), missing.copy()
-    far[count:] *= 100
+    far[alone] *= 100
     straight = space.straighten(step, near)
-    np.testing.assert_array_equal(straight[count:], step[count:])
-    np.testing.assert_array_equal(straight[:count], space.straighten(step, far)[:count])
+    assert alone[count:].all()
+    np.testing.assert_array_equal(straight[alone], step[alone])
+    np.testing.assert_array_equal(straight[~alone], space.straighten(step, far)[~alone])
     shares = straight[posture] / missing[posture]
     np.testing.assert_allclose(shares, np.min(np.abs(step / missing)[posture]))
     np.testing.assert_array_equal(straight[space.mobile_only], step[space.mobile_only])
@@ -83,7 +85,7 @@ def test_a_body_is_what_it_names(spaces):
 def test_an_unknown_entry_lists_the_known_ones(spaces):
     with pytest.raises(UnknownName) as caught:
         spaces["rby1"].make_mask(("torso_0", "torso_9"))
-    assert str(caught.value).startswith("unknown command 'torso_9'. Known: left_arm_0, left_arm_1")
+    assert str(caught.value).startswith("unknown command 'torso_9'. Known: head_0, head_1, left")
     assert str(caught.value).endswith("torso_5, v, yaw_rate")
 
 

@@ -264,7 +264,7 @@ def test_when_no_plan_comes_any_more_the_robot_brakes_smoothly():
     _, records = follow("rby1", 0.04, seconds=0.8, compensate=True)
     start, action = records[-1][0], records[-1][1]
     plan = records[-1][3]
-    moving = dataclasses.replace(plan.plan, commands=plan.plan.commands + [[0.5] + [0.0] * 7])
+    moving = dataclasses.replace(plan.plan, commands=plan.plan.commands + [[0.5] + [0.0] * 9])
     plan = plan._replace(plan=moving)
     space, previous, speeds = morphology.command_space, action.command, []
     for i in range(40):

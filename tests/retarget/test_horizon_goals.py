@@ -18,7 +18,7 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
     rotation_error,
 )
-from xop_lerobot.retarget.horizon_goals import hold_level, hold_near, preview
+from xop_lerobot.retarget.horizon_goals import TILT_PREVIEW_S, hold_level, hold_near, preview
 
 HERE = make_pose(np.array([1.0, 2.0, 1.4]), quat_from_yaw(0.3))
 
@@ -83,7 +83,8 @@ def test_a_goal_is_carried_on_up_to_the_preview():
     start = goal.poses["head"]
     for time, pose in zip(np.minimum(times, 0.3), poses, strict=True):
         np.testing.assert_allclose(pose[:3], start[:3] + time * velocity[:3])
-        turned = quat_multiply(quat_exp(time * velocity[3:]), start[3:])
+        tilt = quat_exp(min(time, TILT_PREVIEW_S) * velocity[3:] * [1, 1, 0])
+        turned = quat_multiply(quat_from_yaw(time * velocity[5]), quat_multiply(tilt, start[3:]))
         np.testing.assert_allclose(rotation_error(turned, pose[3:]), 0, atol=1e-12)
 
 

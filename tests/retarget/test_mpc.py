@@ -194,7 +194,7 @@ def test_a_wall_shows_in_the_cost(walled):
         b = Bench(morphology, SMALL, seen)
         goal = b.make_goal(Mode.MOBILE, (0.8, 0, 0))
         plans = [b.tick(goal) for _ in range(25)]
-        costs.append(plans[-1].cost["collision"])
+        costs.append(max(plan.cost["collision"] for plan in plans))
         distances.append(wall - b.head[0])
         b.close()
     assert costs[0] > 0.02
@@ -383,7 +383,7 @@ def test_it_may_be_closed_twice(bench):
 
 
 def test_the_goal_is_carried_on_at_its_velocity(bench):
-    """Slow twin of the preview: constant velocity up to `preview_s`, then it stands."""
+    """Slow reference of the preview: constant velocity up to `preview_s`, then it stands."""
     b = bench("rby1")
     velocity = np.array([0.3, -0.2, 0.1, 0, 0, 0.5])
     goal = b.make_goal(Mode.MOBILE, (0, 0, 0), velocities={"head": velocity})
@@ -419,7 +419,8 @@ def many_knots():
 def test_noise_on_what_does_not_act_is_masked(many_knots):
     plan = many_knots.tick(many_knots.make_goal(Mode.STATIONARY, (0.5, 0, 0), 0.5))
     np.testing.assert_array_equal(plan.commands[:, :2], 0)
-    assert np.ptp(plan.commands[:, -1]) > 0  # several knots: it varies over the horizon
+    turning = many_knots.morphology.command_space.index("torso_5")
+    assert np.ptp(plan.commands[:, turning]) > 0  # several knots: it varies over the horizon
 
 
 def test_a_plan_goes_on_where_the_last_one_was(many_knots):

@@ -15,7 +15,9 @@ from xop_lerobot.core.command import Mode
 from xop_lerobot.core.state import Goal, RobotState
 from xop_lerobot.core.transforms import (
     heading_error,
+    make_pose,
     quat_exp,
+    quat_from_rpy,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
@@ -52,6 +54,7 @@ class Parts:
         self.command_model = CommandModel(
             self.model, self.space, self.morphology.effects, self.morphology.pivot
         )
+        self.body = np.array([effect.gaze is None for effect in self.morphology.effects])
         self.head = self.morphology.frames["head"]
         self.kinematics = SiteKinematics(self.model, (self.head,))
         self.proposal = self.make()
@@ -69,9 +72,10 @@ class Parts:
         return self.kinematics.compute_poses(future)[self.head]
 
     def draw(self, rng: np.random.Generator, mode: Mode, share: float = 0.3) -> np.ndarray:
-        """A command around neutral, within the bounds, that acts in `mode`."""
-        scale = share * (self.space.high - self.space.low) / 2
-        command = self.space.neutral + scale * rng.uniform(-1, 1, len(self.space))
+        """A command around neutral, within the bounds, that acts in `mode`, the neck straight."""
+        scale = share * (self.space.high - self.space.low)[self.body] / 2
+        command = self.space.neutral.copy()
+        command[self.body] += scale * rng.uniform(-1, 1, len(scale))
         command = np.clip(command, self.space.low, self.space.high)
         return np.where(self.command_model.acting(mode), command, self.space.neutral)
 
@@ -212,11 +216,40 @@ def test_it_recovers_what_the_goal_was_made_with(parts, name, mode):
         wanted = p.draw(np.random.default_rng(seed), mode)
         goal = p.reach(wanted, mode)
         far = measure_error(p.reach(p.space.neutral, mode), goal)
-        got = p.solve({"head": goal}, mode, DT)
+        got = p.solve({"head": goal}, mode, DT, free=p.command_model.acting(mode) & p.body)
         near = measure_error(p.reach(got, mode), goal)
         # The effort keeps it a little short of the goal.
         assert near[0] < max(0.1 * far[0], 0.01)
         assert near[1] < max(0.15 * far[1], 0.05)
+
+
+def look(yaw: float, pitch: float, home: np.ndarray) -> np.ndarray:
+    """Pose of a head at its place that is turned aside and down."""
+    return make_pose(home[:3], quat_multiply(quat_from_yaw(yaw), quat_from_rpy(0.0, pitch, 0.0)))
+
+
+@modes
+@pytest.mark.parametrize("aside", [(0.3, 0.0), (0.0, 0.3), (-0.2, -0.2)])
+def test_a_neck_stays_straight_for_a_head_that_looks_ahead(parts, mode, aside):
+    """It does not turn against the chest, to move the head by some centimetres."""
+    p = parts["rby1"]
+    goal = p.reach(p.space.neutral, mode)
+    goal[:2] += aside
+    got = p.solve({"head": goal}, mode, DT)
+    np.testing.assert_allclose(got[~p.body], 0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "turn, least, most", [(1.7, 0.0, 1.57), (-1.2, -1.2, 0.0), (3.0, -1.57, 1.57)]
+)
+def test_a_neck_turns_to_either_side_only_for_a_goal_behind_the_robot(parts, turn, least, most):
+    p = parts["rby1"]
+    bounds = (p.space.low, p.space.high)
+    low, high = p.command_model.limit_gaze(bounds, look(turn, 0.3, p.qpos[:7]), p.qpos[:7])
+    i, j = p.space.index("head_0"), p.space.index("head_1")
+    assert (low[i], high[i]) == pytest.approx((least, most))
+    assert (low[j], high[j]) == pytest.approx((0.0, 0.3))
+    np.testing.assert_array_equal(low[p.body], p.space.low[p.body])
 
 
 @robots
@@ -435,7 +468,8 @@ def test_at_the_solution_no_free_entry_can_do_better(parts, name, mode):
         scaled = (got - p.space.neutral) / proposal.scale
         gradient = proposal.scale * (jacobian.T @ residual) + effort**2 * scaled
         acting = p.command_model.acting(mode)
-        at_low, at_high = got <= p.space.low + 1e-9, got >= p.space.high - 1e-9
+        low, high = p.command_model.limit_gaze((p.space.low, p.space.high), goal, p.qpos[:7])
+        at_low, at_high = got <= low + 1e-9, got >= high - 1e-9
         assert (np.abs(gradient[acting & ~at_low & ~at_high]) < 2e-4).all()
         assert (gradient[acting & at_low] > -2e-4).all()
         assert (gradient[acting & at_high] < 2e-4).all()

@@ -54,4 +54,4 @@ def test_only_a_body_on_stiff_servos_is_filtered():
         np.testing.assert_array_equal(body.update(qpos, command, DT), qpos)
         moved = body.update(qpos + 0.1, command, DT)
         assert (moved != qpos + 0.1).any() == changes
-        assert np.count_nonzero(moved != qpos + 0.1) == (6 if changes else 0)
+        assert np.count_nonzero(moved != qpos + 0.1) == (8 if changes else 0)

@@ -11,6 +11,7 @@ from xop_lerobot.core.command import Mode
 
 FRAMES = ("head", "left_wrist", "right_wrist")
 """Names of the operator's tracked frames, in the order of all `tracked` flags."""
+HEAD = FRAMES[0]
 
 
 def freeze(array: np.ndarray) -> np.ndarray:

@@ -18,6 +18,13 @@ class Acts(Enum):
     TURN = "yaw rate of the base"
 
 
+class Gaze(Enum):
+    """Angle of the head's goal that limits a joint of the neck."""
+
+    HEADING = "heading of the goal relative to the base"
+    PITCH = "pitch of the goal in its heading"
+
+
 @dataclass(frozen=True)
 class Effect:
     """Effect of one entry of a command.
@@ -30,6 +37,7 @@ class Effect:
         sway_s: Weight shift of the base in stationary mode: displacement per velocity, reached
             with `lag_s` [m/(m/s)].
         effort: Relative effort weight of the entry in the kinematic proposal [1].
+        gaze: Angle of the head's goal that the joint does not exceed, for a neck; None for none.
     """
 
     acts: Acts
@@ -38,3 +46,4 @@ class Effect:
     modes: tuple[Mode, ...] = (Mode.STATIONARY, Mode.MOBILE)
     sway_s: float = 0.0
     effort: float = 1.0
+    gaze: Gaze | None = None

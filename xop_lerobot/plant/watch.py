@@ -40,6 +40,27 @@ CALM_S = 1.0
 """Time without an anomaly after which `trouble` is cleared [s]."""
 
 
+def find_load_bearing(
+    morphology: Morphology, model: mujoco.MjModel
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the joints of the posture, which carry the upper body.
+
+    A joint that moves alone, such as a neck's, carries little, and lags far behind quick targets.
+
+    Returns:
+        Their columns in the command, and their addresses in qpos. Shapes (n,), int.
+    """
+    joints = [
+        (column, int(model.joint(effect.joint).qposadr[0]))
+        for column, (effect, dim) in enumerate(
+            zip(morphology.effects, morphology.command_space.dims, strict=True)
+        )
+        if effect.acts is Acts.JOINT and not dim.alone
+    ]
+    columns, addresses = np.array(joints, dtype=int).reshape(-1, 2).T
+    return columns, addresses
+
+
 class Watch:
     """Monitors a robot for motion that the operator did not command, once per policy period.
 
@@ -48,8 +69,8 @@ class Watch:
     place, the base must not move fast while the velocity commands are about zero. The reference
     position slowly follows the estimate, so that drift of the odometry raises no alarm.
 
-    *Its servos give way.* A body joint whose tracking error exceeds `Servos.gap` carries more than
-    its motor can.
+    *Its servos give way.* A body joint of the posture whose tracking error exceeds `Servos.gap`
+    carries more than its motor can.
 
     Args:
         morphology: The robot.
@@ -64,15 +85,7 @@ class Watch:
         self._velocities = np.array(
             [each in (Acts.FORWARD, Acts.LEFT, Acts.TURN) for each in acts], dtype=bool
         )
-        self._joints = np.array([each is Acts.JOINT for each in acts], dtype=bool)
-        self._addresses = np.array(
-            [
-                int(self._model.joint(effect.joint).qposadr[0])
-                for effect in morphology.effects
-                if effect.acts is Acts.JOINT
-            ],
-            dtype=int,
-        )
+        self._columns, self._addresses = find_load_bearing(morphology, self._model)
         self._gap_limit = morphology.servos.gap if morphology.servos else math.inf
         self.reset()
 
@@ -106,7 +119,7 @@ class Watch:
             self.trouble = ""
 
     def _gives_way(self, qpos: np.ndarray, action: RobotAction) -> bool:
-        gaps = np.abs(action.command[self._joints] - qpos[self._addresses])
+        gaps = np.abs(action.command[self._columns] - qpos[self._addresses])
         behind = gaps.max(initial=0.0) > self._gap_limit
         self._gap = self._gap + POLICY_DT if behind else 0.0
         return self._gap > GAP_S

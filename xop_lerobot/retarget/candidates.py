@@ -13,16 +13,25 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.state import Goal, RobotState
+from xop_lerobot.core.state import HEAD, Goal, RobotState
+from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.costs.balance import SupportArea
 from xop_lerobot.retarget.decision import DecisionSpace
 from xop_lerobot.retarget.direct import DirectRetargeter
 from xop_lerobot.retarget.model.command_model import CommandModel, PlannerState
-from xop_lerobot.retarget.model.proposal import KinematicProposal, make_proposal_weights, pace
+from xop_lerobot.retarget.model.proposal import (
+    KinematicProposal,
+    ProposalWeights,
+    make_proposal_weights,
+    pace,
+)
 from xop_lerobot.retarget.references import Reference
 from xop_lerobot.retarget.static_load import StaticLoad
+
+_LOOK_S = 0.1  # time in which a neck turns to the goal of the head [s]
+_NECK_EFFORT = 0.002  # small: the neck alone is left to turn the head
 
 
 class Candidates:
@@ -54,6 +63,7 @@ class Candidates:
         self._decision, self._command_model = decision, command_model
         self._direct: DirectRetargeter | None = None
         self.proposals: dict[Mode, KinematicProposal] = {}
+        self._neck: KinematicProposal | None = None
 
     def configure(
         self, configs: Mapping[Mode, MpcConfig], sites: Mapping[str, str], upright: bool
@@ -71,6 +81,13 @@ class Candidates:
             )
             for mode, config in configs.items()
         }
+        self._neck = None
+        if HEAD in sites and (self._command_model.neck & self._command_model.body).any():
+            weights = ProposalWeights(position=(0.0, 0.0, 0.0), effort=_NECK_EFFORT)
+            head = {HEAD: sites[HEAD]}
+            self._neck = KinematicProposal(
+                self._model, self._command_model, head, weights, limits_gaze=False
+            )
 
     def reset(self) -> None:
         """Forget the state of the direct mapping."""
@@ -117,7 +134,30 @@ class Candidates:
             natural=natural,
             balance=reference.balance,
         )
-        return solution.command if np.isfinite(solution.command).all() else executed
+        if not np.isfinite(solution.command).all():
+            return executed
+        return self._look(solution.command, state, reference, mode, config)
+
+    def _look(
+        self,
+        command: np.ndarray,
+        state: PlannerState,
+        reference: Reference,
+        mode: Mode,
+        config: MpcConfig,
+    ) -> np.ndarray:
+        """Turn the neck at once by what the chest leaves to it until `_LOOK_S`. Shape (n,)."""
+        if self._neck is None or HEAD not in reference.goals:
+            return command
+        step = min(round(_LOOK_S / POLICY_DT), config.horizon)
+        return self._neck.solve(
+            state.start,
+            {HEAD: reference.goals[HEAD][step]},
+            mode,
+            max(step, 1) * POLICY_DT,
+            natural=command,
+            free=self._command_model.acting(mode) & self._command_model.neck,
+        ).command
 
     def collect(
         self,

@@ -9,11 +9,14 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from xop_lerobot.core.state import Goal
-from xop_lerobot.core.transforms import make_pose, quat_multiply
+from xop_lerobot.core.transforms import make_pose, quat_from_yaw, quat_multiply
 from xop_lerobot.retarget.costs.tracking import make_level
 
 STILL = 0.1
 """Horizontal speed up to which a goal counts as stationary [m/s]."""
+TILT_PREVIEW_S = 0.1
+"""Longest time for which a goal is assumed to go on tilting [s]. Heads nod up again within tenths
+of a second, so that a tilt that is carried on for longer overshoots; turns last longer."""
 
 
 def is_moving(goal: Goal, name: str) -> bool:
@@ -65,7 +68,8 @@ def preview(
         goal: The goal now, with its velocities.
         frames: Tracked frames; those without a goal are left out.
         ahead: Times from now [s]. Shape (n,).
-        preview_s: Time after which a goal is assumed to be stationary [s].
+        preview_s: Time after which a goal is assumed to be stationary [s]; it stops tilting after
+            `TILT_PREVIEW_S` if that is less.
 
     Returns:
         Poses. Shapes (n, 7).
@@ -84,7 +88,9 @@ def preview(
 
 
 def carry_on(pose: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> np.ndarray:
-    r"""Extrapolate a pose at constant velocity: :math:`p + v t,\ e^{\omega t/2} \circ q`.
+    r"""Extrapolate a pose: :math:`p + v t,\ e^{\omega_z t/2} \circ e^{\omega_{xy} t'/2} \circ q`.
+
+    t' is t up to `TILT_PREVIEW_S`; a rotation about the vertical goes on for t.
 
     For a constant axis n, :math:`e^{n\alpha/2} \circ q = \cos\frac\alpha2\,q +
     \sin\frac\alpha2\,(n \circ q)`: one quaternion product serves all times.
@@ -98,10 +104,11 @@ def carry_on(pose: np.ndarray, velocity: np.ndarray, times: np.ndarray) -> np.nd
         Poses. Shape (n, 7).
     """
     x, y, z = (float(rate) for rate in velocity[3:])
-    rate = math.sqrt(x * x + y * y + z * z)
-    axis = np.array([0.0, x, y, z]) / max(rate, 1e-12)
-    half = times * (rate / 2)
+    rate = math.hypot(x, y)
+    axis = np.array([0.0, x, y, 0.0]) / max(rate, 1e-12)
+    half = np.minimum(times, TILT_PREVIEW_S) * (rate / 2)
     poses = np.empty((len(times), 7))
     poses[:, :3] = pose[:3] + times * velocity[:3]
-    poses[:, 3:] = np.cos(half) * pose[3:] + np.sin(half) * quat_multiply(axis, pose[3:])
+    tilted = np.cos(half) * pose[3:] + np.sin(half) * quat_multiply(axis, pose[3:])
+    poses[:, 3:] = quat_multiply(quat_from_yaw(times[:, 0] * z), tilted)
     return poses

@@ -230,15 +230,15 @@ class MpcRetargeter(Retargeter):
         # Reference trajectory, and the analytic solution for it.
         reference = self.references.lead(now, goal, config)
         proposal = self.candidates.propose(now, reference, mode, config, optimizer.commands[0])
-        proposal = self._hold(proposal, now, mode)
+        proposal = self._hold(proposal, now, mode, proposal)
         reference = self.references.detour(reference, now, proposal, mode, config)
 
         # Samples: the shifted plan, the fixed candidates, and noise around the plan.
         candidates = self.candidates.collect(state, goal, now, proposal, config)
         share = reference.compute_noise_share(now.poses, config)
         noise = planner.noise_std * self.command_model.acting(mode) * share
-        samples = optimizer.sample(self._rng, noise, self._hold(candidates, now, mode))
-        commands = self.problem.restrict(self._hold(samples.commands, now, mode), mode)
+        samples = optimizer.sample(self._rng, noise, self._hold(candidates, now, mode, proposal))
+        commands = self.problem.restrict(self._hold(samples.commands, now, mode, proposal), mode)
         sampled = perf_counter()
 
         # Dynamics (Eqs. 1b, 1c) and cost (Eq. 1a) of the samples.
@@ -253,7 +253,8 @@ class MpcRetargeter(Retargeter):
         stop = _find_stop(config, len(commands))
         verdict = judge(weights, scores.costs, scores.falls, scores.touches, stop)
         self._apply(verdict, optimizer, samples.commands, now)
-        planned = self.problem.restrict(self._hold(optimizer.commands, now, mode), mode)
+        planned = self._hold(optimizer.commands, now, mode, proposal)
+        planned = self.problem.restrict(planned, mode)
         end = perf_counter()
         timings = {
             "solve": end - begin,
@@ -290,9 +291,15 @@ class MpcRetargeter(Retargeter):
         else:
             optimizer.shift(max(0.0, now.time - self._last[0]) / POLICY_DT)
 
-    def _hold(self, decisions: np.ndarray, now: PlannerState, mode: Mode) -> np.ndarray:
+    def _hold(
+        self,
+        decisions: np.ndarray,
+        now: PlannerState,
+        mode: Mode,
+        proposal: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Set entries that are not decision variables to their held value. (..., n)."""
-        return self.command_model.hold(decisions, now.executed, mode)
+        return self.command_model.hold(decisions, now.executed, mode, proposal)
 
     def _apply(
         self,

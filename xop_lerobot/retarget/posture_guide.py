@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.state import Goal
+from xop_lerobot.core.state import HEAD, Goal
 from xop_lerobot.core.transforms import (
     compute_heading,
     heading_error,
@@ -42,7 +42,6 @@ from xop_lerobot.retarget.model.posture import AT_REST_S, MISSED, Found, Posture
 from xop_lerobot.retarget.model.proposal import KinematicProposal, make_proposal_weights
 from xop_lerobot.retarget.static_load import StaticLoad
 
-HEAD = "head"
 # Effort weights of a posture; below the proposal's 0.02, since there is no deadline to reach it.
 _EFFORT, _LEVEL_EFFORT = 0.002, 0.01
 _NEAR, _SAME = 0.01, 0.03  # error of the posture up to which the goal is not corrected [m], [rad]

@@ -81,7 +81,9 @@ def _make_table1(morphology: Morphology, config: MpcConfig, paper: PaperParamete
     extrapolation, and the distance to the goal is not limited.
     """
     joints = [joint for arm in morphology.arms for joint in arm.joints]
-    entries = (*morphology.command_space.names, *joints)
+    # The paper's commands have no neck.
+    body = [dim.name for dim in morphology.command_space.dims if not dim.alone]
+    entries = (*body, *joints)
     return dataclasses.replace(
         config,
         optimizer="kmppi",

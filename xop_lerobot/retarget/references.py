@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.state import Goal
+from xop_lerobot.core.state import HEAD, Goal
 from xop_lerobot.morphology.morphology import Morphology
 from xop_lerobot.morphology.tuning import MpcConfig
 from xop_lerobot.retarget.costs.balance import SupportArea
@@ -20,7 +20,7 @@ from xop_lerobot.retarget.horizon_goals import hold_level, preview
 from xop_lerobot.retarget.model.command_model import CommandModel, PlannerState
 from xop_lerobot.retarget.model.linearisation import Readings
 from xop_lerobot.retarget.obstacles import Obstacle
-from xop_lerobot.retarget.posture_guide import HEAD, PostureGuide, Served
+from xop_lerobot.retarget.posture_guide import PostureGuide, Served
 from xop_lerobot.retarget.static_load import StaticLoad
 
 

@@ -48,6 +48,9 @@ TORSO_RATES = (0.4, 0.5, 0.8, 0.6, 0.5, 1.2)
 """Rate limits of the torso commands [rad/s]. The joints allow 2.09 and 3.14, but `torso_1` carries
 57 kg: reversing it at full rate takes more than its 270 N m, and the torso folds."""
 
+NECK_ACCELERATION = 60.0
+"""Largest acceleration of the neck commands [rad/s²]; the head is light."""
+
 BASE_HEIGHT = -0.0006
 """Height of the base frame at rest [m]; wheels and casters sink in by their compliance."""
 
@@ -65,6 +68,29 @@ def make_torso_dims() -> tuple[CommandDim, ...]:
         rate = TORSO_RATES[i]
         key = f"{name}.pos"
         dims.append(CommandDim(name, key, "rad", low, high, ready, rate, max_accel=10 * rate))
+    return tuple(dims)
+
+
+def make_neck_dims() -> tuple[CommandDim, ...]:
+    """Return the command entries of the neck: it turns and nods without the torso."""
+    joints = {link.joint.name: link.joint for link in LINKS if link.joint is not None}
+    dims = []
+    for name in ("head_0", "head_1"):
+        joint = joints[name]
+        low, high = joint.limits or (-math.pi, math.pi)
+        dims.append(
+            CommandDim(
+                name,
+                f"{name}.pos",
+                "rad",
+                low,
+                high,
+                0.0,
+                joint.velocity,
+                max_accel=NECK_ACCELERATION,
+                alone=True,
+            )
+        )
     return tuple(dims)
 
 
@@ -88,6 +114,7 @@ class RBY1(Morphology):
                 max_accel=100.0,
             ),
             *make_torso_dims(),
+            *make_neck_dims(),
         )
     )
     policies = ("diff_drive",)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.morphology.effect import Acts, Effect
+from xop_lerobot.morphology.effect import Acts, Effect, Gaze
 from xop_lerobot.morphology.tuning import CostWeights, Driving, MpcConfig
 
 PIVOT = 0.228
@@ -35,6 +35,10 @@ EFFECTS = (
         Effect(Acts.JOINT, f"torso_{i}", lag_s=0.1, effort=effort)
         for i, effort in enumerate((10.0, 4.0, 4.0, 4.0, 10.0, 1.0))
     ),
+    # The neck is quick: it takes the first part of a turn of the head, until the chest has
+    # followed, and its share of a nod.
+    Effect(Acts.JOINT, "head_0", lag_s=0.05, effort=20.0, gaze=Gaze.HEADING),
+    Effect(Acts.JOINT, "head_1", lag_s=0.05, gaze=Gaze.PITCH),
 )
 
 DRIVING = Driving(

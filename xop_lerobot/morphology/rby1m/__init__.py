@@ -9,7 +9,13 @@ import numpy as np
 from xop_lerobot.core.command import CommandDim, CommandSpace, Mode
 from xop_lerobot.morphology.contacts import Contact, Wheels
 from xop_lerobot.morphology.morphology import ModelKind, WheelDrive
-from xop_lerobot.morphology.rby1 import GRIPPER_OPEN, RBY1, TORSO_READY, make_torso_dims
+from xop_lerobot.morphology.rby1 import (
+    GRIPPER_OPEN,
+    RBY1,
+    TORSO_READY,
+    make_neck_dims,
+    make_torso_dims,
+)
 from xop_lerobot.morphology.rby1m.links import HALF_LENGTH, HALF_WIDTH, LINKS, WHEEL_RADIUS
 from xop_lerobot.morphology.rby1m.mpc import CONFIGS, EFFECTS, PIVOT, SUPPORT
 
@@ -64,6 +70,7 @@ class RBY1M(RBY1):
                 max_accel=100.0,
             ),
             *make_torso_dims(),
+            *make_neck_dims(),
         )
     )
     policies = ("mecanum_drive",)

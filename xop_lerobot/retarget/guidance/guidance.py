@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.state import Goal
+from xop_lerobot.core.state import HEAD, Goal
 from xop_lerobot.core.transforms import compute_heading, quat_from_yaw, quat_multiply, quat_yaw
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.effect import Acts
@@ -22,7 +22,7 @@ from xop_lerobot.retarget.costs.balance import compute_facing
 from xop_lerobot.retarget.guidance.route import Footprint, RoutePlanner
 from xop_lerobot.retarget.horizon_goals import hold_near, is_moving, preview
 from xop_lerobot.retarget.model.command_model import CommandModel, PlannerState
-from xop_lerobot.retarget.posture_guide import HEAD, Served
+from xop_lerobot.retarget.posture_guide import Served
 
 
 class FacingRule:
@@ -83,12 +83,23 @@ _UPRIGHT = 0.9  # cosine to the vertical from which a joint axis counts as verti
 
 
 def find_waist_axis(morphology: Morphology, model: mujoco.MjModel) -> float:
-    """Forward distance of the uppermost vertical joint from the base of a standing robot [m]."""
+    """Forward distance of the waist from the base of a standing robot [m].
+
+    That is the uppermost vertical joint that carries the arms: a neck turns the head alone.
+    """
     data = mujoco.MjData(model)
     data.qpos[: len(morphology.standing_qpos())] = morphology.standing_qpos()
     mujoco.mj_kinematics(model, data)
+    carriers, body = set(), int(model.joint(morphology.arms[0].joints[0]).bodyid[0])
+    while body:
+        carriers.add(body)
+        body = int(model.body_parentid[body])
     joints = [model.joint(each.joint).id for each in morphology.effects if each.acts is Acts.JOINT]
-    upright = [joint for joint in joints if data.xaxis[joint, 2] > _UPRIGHT]
+    upright = [
+        joint
+        for joint in joints
+        if data.xaxis[joint, 2] > _UPRIGHT and int(model.jnt_bodyid[joint]) in carriers
+    ]
     return float(data.xanchor[upright[-1], 0]) if upright else 0.0
 
 

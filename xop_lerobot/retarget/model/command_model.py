@@ -15,18 +15,21 @@ import numpy as np
 
 from xop_lerobot.core.command import CommandSpace, Mode
 from xop_lerobot.core.transforms import (
+    compute_heading,
     quat_conjugate,
     quat_from_yaw,
     quat_multiply,
     quat_rotate,
     quat_yaw,
+    wrap_angle,
 )
 from xop_lerobot.low_level.rest import BaseRest, RestMap
-from xop_lerobot.morphology.effect import Acts, Effect
+from xop_lerobot.morphology.effect import Acts, Effect, Gaze
 from xop_lerobot.morphology.morphology import Morphology
 
 _TWIST = (Acts.FORWARD, Acts.LEFT, Acts.TURN)
 _TURN = 2
+_BEHIND = 2.5  # heading of a goal from which a neck may turn on either side [rad]
 _ALONG = 0.99  # cosine of the angle up to which a joint axis counts as parallel to an axis
 
 
@@ -100,6 +103,9 @@ class CommandModel:
         pivot: Forward distance from the base's frame to its centre of rotation [m].
         rest: Lean and displacement of a standing base by its policy; None if it has none.
 
+    Attributes:
+        neck: Mask of the joints of a neck. Shape (k,), bool.
+
     Raises:
         UnknownName: If `rest` names entries that are not in `space`.
     """
@@ -133,6 +139,8 @@ class CommandModel:
         self._address = np.array([int(joint.qposadr[0]) if joint else 2 for joint in joints])
         self._dof = np.array([int(joint.dofadr[0]) if joint else 2 for joint in joints])
         self._lag = np.array([effect.lag_s for effect in effects])
+        self._gazes = [(i, effect.gaze) for i, effect in enumerate(effects) if effect.gaze]
+        self.neck = np.array([effect.gaze is not None for effect in effects])
         self._modes = {
             mode: np.array([mode in effect.modes for effect in effects])
             & ~(space.mobile_only & (space.sway == 0) & (mode == Mode.STATIONARY))
@@ -165,14 +173,24 @@ class CommandModel:
         """Mask of the free entries that have an effect in `mode`. Shape (k,), bool."""
         return self._acting[mode]
 
-    def hold(self, decisions: np.ndarray, executed: np.ndarray, mode: Mode) -> np.ndarray:
+    def hold(
+        self,
+        decisions: np.ndarray,
+        executed: np.ndarray,
+        mode: Mode,
+        proposal: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Set the entries that are not free: velocities to zero, the others as executed.
 
-        Shapes (..., k), (k,) -> (..., k).
+        With a proposal, the joints of a neck move as proposed: they are light, so that nothing
+        has to be tried out.
+
+        Shapes (..., k), (k,), (k,) -> (..., k).
         """
         stays = ~self.body & ~self._is_velocity
         held = np.where(stays, executed, self.space.neutral)
-        return np.where(self.acting(mode), decisions, held)
+        held = np.where(self.acting(mode), decisions, held)
+        return held if proposal is None else np.where(self.neck, proposal, held)
 
     def _compute_share(self, dt: float) -> np.ndarray:
         """Fraction of a step response that height and joints reach after `dt`. Shape (k,)."""
@@ -186,6 +204,37 @@ class CommandModel:
         """Whether the base drives forward but not sideways."""
         acts = {effect.acts for effect in self.effects}
         return Acts.FORWARD in acts and Acts.LEFT not in acts
+
+    def limit_gaze(
+        self, bounds: tuple[np.ndarray, np.ndarray], head: np.ndarray, base: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Limit the joints of a neck to the angles by which the goal of the head is turned.
+
+        They lie between neutral and that angle. A neck that turned further, or the other way,
+        would let the chest, and the arms with it, twist and bend for a centimetre of the head.
+        Towards a goal behind the robot it may turn on either side, as the waist does.
+
+        Args:
+            bounds: Lower and upper bounds of the command. Shapes (k,).
+            head: Goal of the head. Shape (7,).
+            base: Pose of the base. Shape (7,).
+        """
+        if not self._gazes:
+            return bounds
+        low, high = bounds[0].copy(), bounds[1].copy()
+        heading = float(compute_heading(head[3:]))
+        w, _, y, _ = quat_multiply(quat_from_yaw(-heading), head[3:])
+        angles = {
+            Gaze.HEADING: float(wrap_angle(heading - quat_yaw(base[3:7]))),
+            Gaze.PITCH: float(wrap_angle(2 * math.atan2(y, w))),
+        }
+        for i, gaze in self._gazes:
+            angle, neutral = angles[gaze], self.space.neutral[i]
+            if gaze is Gaze.HEADING and abs(angle) > _BEHIND:
+                continue
+            low[i] = max(low[i], min(neutral, angle))
+            high[i] = min(high[i], max(neutral, angle))
+        return low, high
 
     def is_velocity(self) -> np.ndarray:
         """Mask of the entries that are base velocities. Shape (k,), bool."""

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from xop_lerobot.core.command import Mode
+from xop_lerobot.core.state import HEAD
 from xop_lerobot.core.transforms import quat_rotate, quat_yaw
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.retarget.costs.balance import SupportArea, compute_lateral
@@ -110,6 +111,8 @@ class KinematicProposal:
         base_body: The robot's root body, for the centre of mass.
         load: Static loads of the joints; None if they are not limited.
         iterations: Largest number of linearisations.
+        limits_gaze: Whether a neck turns no further than the head's goal: without that, chest and
+            neck twist against each other. The neck alone may have to turn back from the chest.
     """
 
     def __init__(
@@ -122,12 +125,14 @@ class KinematicProposal:
         base_body: str = "",
         load: StaticLoad | None = None,
         iterations: int = 6,
+        limits_gaze: bool = True,
     ) -> None:
         self.command_model, self.sites = command_model, dict(sites)
         self.weights = weights or ProposalWeights()
         self._position = np.array(self.weights.position)
         self._orientation = np.array(self.weights.orientation)
         self.support, self.load, self.iterations = support, load, iterations
+        self._limits_gaze = limits_gaze
         self._linearisation = Linearisation(model)
         self._site_ids = {name: find_site(model, site) for name, site in self.sites.items()}
         self._base = model.body(base_body).id if support is not None else 0
@@ -179,6 +184,8 @@ class KinematicProposal:
         if not len(index) or not goals:
             return Solution(command, 0.0, 0.0)
         low, high = bounds or space.bounds(mode)
+        if self._limits_gaze and HEAD in goals:
+            low, high = self.command_model.limit_gaze((low, high), goals[HEAD], begin.qpos[:7])
         if executed is not None:  # commands beyond the rate limits have no further effect
             reach = space.compute_max_rate(mode, executed) * dt
             low, high = np.maximum(low, executed - reach), np.minimum(high, executed + reach)
