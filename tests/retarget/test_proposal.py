@@ -25,6 +25,7 @@ from xop_lerobot.core.transforms import (
     rotation_error,
 )
 from xop_lerobot.low_level.factory import make_policy
+from xop_lerobot.morphology.g1.mpc import WALKING_LEAN
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation
@@ -54,7 +55,7 @@ class Parts:
         self.command_model = CommandModel(
             self.model, self.space, self.morphology.effects, self.morphology.pivot
         )
-        self.body = np.array([effect.gaze is None for effect in self.morphology.effects])
+        self.body = np.array([not effect.neck for effect in self.morphology.effects])
         self.head = self.morphology.frames["head"]
         self.kinematics = SiteKinematics(self.model, (self.head,))
         self.proposal = self.make()
@@ -239,13 +240,33 @@ def test_a_neck_stays_straight_for_a_head_that_looks_ahead(parts, mode, aside):
     np.testing.assert_allclose(got[~p.body], 0, atol=1e-9)
 
 
+@pytest.mark.parametrize("pitch", [0.0, 0.4])
+@pytest.mark.parametrize("aside", [(0.6, 0.0, 0.0), (0.0, 0.0, -0.2), (0.0, 0.4, 0.0)])
+def test_a_walking_waist_bends_little_beyond_the_head_of_the_operator(parts, aside, pitch):
+    """It bows neither to one who is ahead of it nor to one who crouches, as a standing one does."""
+    p = parts["g1"]
+    home = p.reach(p.space.neutral, Mode.MOBILE)
+    goal = look(0.0, pitch, home)
+    goal[:3] += aside
+    names = p.space.names
+    roll, bow = names.index("waist_roll"), names.index("waist_pitch")
+    got = p.solve({"head": goal}, Mode.MOBILE, 0.2)
+    assert abs(got[roll]) <= WALKING_LEAN + 1e-9
+    assert -WALKING_LEAN - 1e-9 <= got[bow] <= pitch + WALKING_LEAN + 1e-9
+    standing = p.command_model.limit_gaze(
+        (p.space.low, p.space.high), goal, p.qpos[:7], Mode.STATIONARY
+    )
+    np.testing.assert_array_equal(standing, (p.space.low, p.space.high))
+
+
 @pytest.mark.parametrize(
     "turn, least, most", [(1.7, 0.0, 1.57), (-1.2, -1.2, 0.0), (3.0, -1.57, 1.57)]
 )
 def test_a_neck_turns_to_either_side_only_for_a_goal_behind_the_robot(parts, turn, least, most):
     p = parts["rby1"]
     bounds = (p.space.low, p.space.high)
-    low, high = p.command_model.limit_gaze(bounds, look(turn, 0.3, p.qpos[:7]), p.qpos[:7])
+    base = p.qpos[:7]
+    low, high = p.command_model.limit_gaze(bounds, look(turn, 0.3, base), base, Mode.MOBILE)
     i, j = p.space.index("head_0"), p.space.index("head_1")
     assert (low[i], high[i]) == pytest.approx((least, most))
     assert (low[j], high[j]) == pytest.approx((0.0, 0.3))
@@ -468,7 +489,8 @@ def test_at_the_solution_no_free_entry_can_do_better(parts, name, mode):
         scaled = (got - p.space.neutral) / proposal.scale
         gradient = proposal.scale * (jacobian.T @ residual) + effort**2 * scaled
         acting = p.command_model.acting(mode)
-        low, high = p.command_model.limit_gaze((p.space.low, p.space.high), goal, p.qpos[:7])
+        bounds = (p.space.low, p.space.high)
+        low, high = p.command_model.limit_gaze(bounds, goal, p.qpos[:7], mode)
         at_low, at_high = got <= low + 1e-9, got >= high - 1e-9
         assert (np.abs(gradient[acting & ~at_low & ~at_high]) < 2e-4).all()
         assert (gradient[acting & at_low] > -2e-4).all()

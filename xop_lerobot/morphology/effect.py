@@ -19,10 +19,26 @@ class Acts(Enum):
 
 
 class Gaze(Enum):
-    """Angle of the head's goal that limits a joint of the neck."""
+    """Angle of the head's goal."""
 
     HEADING = "heading of the goal relative to the base"
     PITCH = "pitch of the goal in its heading"
+    ROLL = "roll of the goal in its heading"
+
+
+@dataclass(frozen=True)
+class GazeLimit:
+    """Limits a joint to between neutral and an angle of the head's goal.
+
+    Attributes:
+        angle: The angle.
+        margin: How far the joint may exceed it on either side [rad].
+        modes: Modes in which it is limited.
+    """
+
+    angle: Gaze
+    margin: float = 0.0
+    modes: tuple[Mode, ...] = (Mode.STATIONARY, Mode.MOBILE)
 
 
 @dataclass(frozen=True)
@@ -37,7 +53,8 @@ class Effect:
         sway_s: Weight shift of the base in stationary mode: displacement per velocity, reached
             with `lag_s` [m/(m/s)].
         effort: Relative effort weight of the entry in the kinematic proposal [1].
-        gaze: Angle of the head's goal that the joint does not exceed, for a neck; None for none.
+        gaze: Limit of the joint by the goal of the head; None for none.
+        neck: Whether it is a joint of the neck, which turns the head alone.
     """
 
     acts: Acts
@@ -46,4 +63,5 @@ class Effect:
     modes: tuple[Mode, ...] = (Mode.STATIONARY, Mode.MOBILE)
     sway_s: float = 0.0
     effort: float = 1.0
-    gaze: Gaze | None = None
+    gaze: GazeLimit | None = None
+    neck: bool = False

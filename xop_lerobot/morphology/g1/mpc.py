@@ -3,18 +3,36 @@
 from __future__ import annotations
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.morphology.effect import Acts, Effect
+from xop_lerobot.morphology.effect import Acts, Effect, Gaze, GazeLimit
 from xop_lerobot.morphology.tuning import CostWeights, MpcConfig
 
 STATIONARY = (Mode.STATIONARY,)
+
+MOBILE = (Mode.MOBILE,)
+
+WALKING_LEAN = 0.12
+"""How far the waist of a walking robot bends beyond the operator's head [rad]. With more it bows to
+a crouching operator, whose height it does not take, and to one who is ahead of it."""
 
 EFFECTS = (
     # While walking the policy neither squats nor turns its waist.
     # It lags behind a height ramp of 0.25 m/s by 0.21 s (default policy) or 0.23 s (FALCON).
     Effect(Acts.HEIGHT, lag_s=0.2, modes=STATIONARY),
     Effect(Acts.JOINT, "waist_yaw_joint", lag_s=0.2, modes=STATIONARY),
-    Effect(Acts.JOINT, "waist_roll_joint", lag_s=0.1, effort=5.0),
-    Effect(Acts.JOINT, "waist_pitch_joint", lag_s=0.1, effort=2.0),
+    Effect(
+        Acts.JOINT,
+        "waist_roll_joint",
+        lag_s=0.1,
+        effort=5.0,
+        gaze=GazeLimit(Gaze.ROLL, WALKING_LEAN, MOBILE),
+    ),
+    Effect(
+        Acts.JOINT,
+        "waist_pitch_joint",
+        lag_s=0.1,
+        effort=2.0,
+        gaze=GazeLimit(Gaze.PITCH, WALKING_LEAN, MOBILE),
+    ),
     # While standing it responds to a small velocity by shifting its weight, 2.4 cm for 0.1 m/s.
     Effect(Acts.FORWARD, lag_s=0.3, sway_s=0.24, effort=0.3),
     Effect(Acts.LEFT, lag_s=0.3, sway_s=0.22, effort=0.3),

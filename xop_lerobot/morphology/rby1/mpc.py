@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.morphology.effect import Acts, Effect, Gaze
+from xop_lerobot.morphology.effect import Acts, Effect, Gaze, GazeLimit
 from xop_lerobot.morphology.tuning import CostWeights, Driving, MpcConfig
 
 PIVOT = 0.228
@@ -37,8 +37,8 @@ EFFECTS = (
     ),
     # The neck is quick: it takes the first part of a turn of the head, until the chest has
     # followed, and its share of a nod.
-    Effect(Acts.JOINT, "head_0", lag_s=0.05, effort=20.0, gaze=Gaze.HEADING),
-    Effect(Acts.JOINT, "head_1", lag_s=0.05, gaze=Gaze.PITCH),
+    Effect(Acts.JOINT, "head_0", lag_s=0.05, effort=20.0, gaze=GazeLimit(Gaze.HEADING), neck=True),
+    Effect(Acts.JOINT, "head_1", lag_s=0.05, gaze=GazeLimit(Gaze.PITCH), neck=True),
 )
 
 DRIVING = Driving(

@@ -140,7 +140,7 @@ class CommandModel:
         self._dof = np.array([int(joint.dofadr[0]) if joint else 2 for joint in joints])
         self._lag = np.array([effect.lag_s for effect in effects])
         self._gazes = [(i, effect.gaze) for i, effect in enumerate(effects) if effect.gaze]
-        self.neck = np.array([effect.gaze is not None for effect in effects])
+        self.neck = np.array([effect.neck for effect in effects])
         self._modes = {
             mode: np.array([mode in effect.modes for effect in effects])
             & ~(space.mobile_only & (space.sway == 0) & (mode == Mode.STATIONARY))
@@ -206,34 +206,42 @@ class CommandModel:
         return Acts.FORWARD in acts and Acts.LEFT not in acts
 
     def limit_gaze(
-        self, bounds: tuple[np.ndarray, np.ndarray], head: np.ndarray, base: np.ndarray
+        self,
+        bounds: tuple[np.ndarray, np.ndarray],
+        head: np.ndarray,
+        base: np.ndarray,
+        mode: Mode,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Limit the joints of a neck to the angles by which the goal of the head is turned.
+        """Limit joints to between neutral and the angles by which the goal of the head is turned.
 
-        They lie between neutral and that angle. A neck that turned further, or the other way,
-        would let the chest, and the arms with it, twist and bend for a centimetre of the head.
-        Towards a goal behind the robot it may turn on either side, as the waist does.
+        A neck that turned further, or the other way, would let the chest, and the arms with it,
+        twist and bend for a centimetre of the head; a waist that did would bend a walking robot
+        towards a goal that it is late for. Towards a goal behind the robot a joint may turn on
+        either side.
 
         Args:
             bounds: Lower and upper bounds of the command. Shapes (k,).
             head: Goal of the head. Shape (7,).
             base: Pose of the base. Shape (7,).
+            mode: Mode of the robot.
         """
         if not self._gazes:
             return bounds
         low, high = bounds[0].copy(), bounds[1].copy()
         heading = float(compute_heading(head[3:]))
-        w, _, y, _ = quat_multiply(quat_from_yaw(-heading), head[3:])
+        w, x, y, _ = quat_multiply(quat_from_yaw(-heading), head[3:])
         angles = {
             Gaze.HEADING: float(wrap_angle(heading - quat_yaw(base[3:7]))),
             Gaze.PITCH: float(wrap_angle(2 * math.atan2(y, w))),
+            Gaze.ROLL: float(wrap_angle(2 * math.atan2(x, w))),
         }
-        for i, gaze in self._gazes:
-            angle, neutral = angles[gaze], self.space.neutral[i]
-            if gaze is Gaze.HEADING and abs(angle) > _BEHIND:
+        for i, limit in self._gazes:
+            angle, neutral = angles[limit.angle], self.space.neutral[i]
+            behind = limit.angle is Gaze.HEADING and abs(angle) > _BEHIND
+            if behind or mode not in limit.modes:
                 continue
-            low[i] = max(low[i], min(neutral, angle))
-            high[i] = min(high[i], max(neutral, angle))
+            low[i] = max(low[i], min(neutral, angle) - limit.margin)
+            high[i] = min(high[i], max(neutral, angle) + limit.margin)
         return low, high
 
     def is_velocity(self) -> np.ndarray:

@@ -185,7 +185,8 @@ class KinematicProposal:
             return Solution(command, 0.0, 0.0)
         low, high = bounds or space.bounds(mode)
         if self._limits_gaze and HEAD in goals:
-            low, high = self.command_model.limit_gaze((low, high), goals[HEAD], begin.qpos[:7])
+            bounds = self.command_model.limit_gaze((low, high), goals[HEAD], begin.qpos[:7], mode)
+            low, high = bounds
         if executed is not None:  # commands beyond the rate limits have no further effect
             reach = space.compute_max_rate(mode, executed) * dt
             low, high = np.maximum(low, executed - reach), np.minimum(high, executed + reach)
