@@ -17,13 +17,54 @@ ARM_MAX_DT = 0.05
 """Upper bound of the time step, so that the arms do not lurch after a stall [s]."""
 
 
+CLEARANCE = 0.025
+"""Distance that arms keep from the rest of the body and from each other [m]."""
+_DETECTED = 0.1  # distance from which two geoms are looked at [m]
+_APPROACH_S = 0.1  # time constant with which geoms approach: soft arms lag and overshoot [s]
+_RETREAT = 0.5  # speed with which geoms that are too close part [m/s]; a torso turns an elbow at it
+_DEEP = -1.0  # distance below any penetration [m]
+
+
+class Clearance(mink.CollisionAvoidanceLimit):
+    r"""Keeps pairs of geoms apart: :math:`\dot d \ge -(d - d_{min}) / T`.
+
+    A velocity damper (Faverjon and Tournassoud, 1987). That of mink bounds the displacement of a
+    step by a velocity, which at steps of 20 ms is fifty times too much, and lets geoms that are
+    too close stay so: a turning torso then takes the arms into the belly. Here they part, by at
+    most `_RETREAT`.
+
+    Args:
+        model: The model.
+        pairs: Pairs of groups of geoms.
+    """
+
+    def __init__(self, model: mujoco.MjModel, pairs: list[tuple[list[int], list[int]]]) -> None:
+        # With a distance below any that occurs, the bound of mink tells the distance itself.
+        super().__init__(
+            model,
+            pairs,
+            gain=1.0,
+            minimum_distance_from_collisions=_DEEP,
+            collision_detection_distance=_DETECTED,
+        )
+
+    def compute_qp_inequalities(
+        self, configuration: mink.Configuration, dt: float
+    ) -> mink.Constraint:
+        r"""Compute the inequality :math:`G\,\Delta q \le h`."""
+        matrix, bound = super().compute_qp_inequalities(configuration, dt)
+        distance = bound * dt + _DEEP  # infinite for pairs that are far apart
+        approach = np.maximum((distance - CLEARANCE) / _APPROACH_S, -_RETREAT)
+        return mink.Constraint(matrix, approach * dt)
+
+
 class ArmIk:
     """Moves the arms towards wrist goals, with the rest of the body fixed as measured.
 
     Each solve starts from its own last solution, not from the measured arms, so that sensor noise
     and sag do not enter. Joint limits and a speed limit hold by construction. Elbows, forearms and
-    hands keep a distance from the rest of the body, to first order per step and up to the servo
-    lag. A weak posture task pulls towards the rest angles and keeps the elbows from drifting in
+    hands keep a distance from the rest of the body and from each other (`Clearance`), up to the
+    servo lag. A weak posture task pulls towards the rest angles and keeps the elbows from drifting in
     the null space.
 
     Args:
@@ -76,12 +117,7 @@ class ArmIk:
         self._limits = [
             mink.ConfigurationLimit(model, gain=0.5),
             mink.VelocityLimit(model, dict.fromkeys(joints, max_speed)),
-            mink.CollisionAvoidanceLimit(
-                model,
-                _find_pairs(model, morphology),
-                minimum_distance_from_collisions=0.025,
-                collision_detection_distance=0.1,
-            ),
+            Clearance(model, _find_pairs(model, morphology)),
         ]
         limited = np.flatnonzero(model.jnt_limited)
         self._limited = model.jnt_qposadr[limited]
