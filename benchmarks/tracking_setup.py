@@ -20,7 +20,6 @@ from xop_lerobot.core.yaml_words import load_yaml
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.tuning import MpcConfig
-from xop_lerobot.retarget.candidates import Intervention, Verdict
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.presets import build_configs
 
@@ -78,11 +77,6 @@ def _always(value: object) -> Callable[[Callable[..., Any]], Callable[..., Any]]
     return lambda _stock: lambda *_args, **_kwargs: value
 
 
-def _without_learning(stock: Callable[..., Any]) -> Callable[..., Any]:
-    """Replace an observer's `update` by one that never learns."""
-    return lambda *args, **kwargs: stock(*args, **{**kwargs, "learns": False})
-
-
 ABLATIONS: dict[str, Ablation] = {
     "default": Ablation("the default preset"),
     "table1": Ablation("our Table I, its own numbers", preset="table1"),
@@ -110,11 +104,10 @@ ABLATIONS: dict[str, Ablation] = {
         "no fixed candidates", {"candidates": (), "control_reference": "neutral"}
     ),
     "no_preview": Ablation("no goal preview", {"preview_s": 0.0}),
-    "no_drift": Ablation("no drift observer", {"observe_drift": False}),
-    "no_offset": Ablation(
-        "no offset observer",
-        replaced={"xop_lerobot.retarget.model.observers:OffsetObserver.update": _without_learning},
-    ),
+    "no_drift": Ablation("no drift observer", {"aids": Without("drift")}),
+    "no_offset": Ablation("no offset observer", {"aids": Without("offset")}),
+    "no_postures": Ablation("no postures for the head's goal", {"aids": Without("postures")}),
+    "no_sway": Ablation("no weight shift in standing", {"aids": Without("sway")}),
     "no_change": Ablation("no cost of change", {"weights.change": 0.0}),
     "no_support": Ablation("no support cost", {"weights.support": 0.0}),
     "no_lean": Ablation("no cost of leaning", {"weights.lean": 0.0}),
@@ -129,16 +122,8 @@ ABLATIONS: dict[str, Ablation] = {
     "no_stop": Ablation("no candidate that stops", {"candidates": Without("stop")}),
     "two_knots": Ablation("two support points", {"num_knots": 2}),
     "four_knots": Ablation("four support points", {"num_knots": 4}),
-    "no_intervention": Ablation(
-        "nothing is slowed or vetoed",
-        replaced={
-            "xop_lerobot.retarget.mpc:judge": _always(Verdict(Intervention.NONE, 0.0)),
-        },
-    ),
-    "no_route": Ablation(
-        "no path and no heading for wheels",
-        replaced={"xop_lerobot.retarget.guidance.guidance:Guidance._drives": _always(False)},
-    ),
+    "no_intervention": Ablation("nothing is slowed or vetoed", {"aids": Without("intervention")}),
+    "no_route": Ablation("no path and no heading for wheels", {"aids": Without("route")}),
     "no_hold": Ablation(
         "what hands hold does not go with the body",
         replaced={"xop_lerobot.retarget.arms.contact:ArmHold.update": _always(None)},

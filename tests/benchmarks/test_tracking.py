@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import cast
 
 import numpy as np
 import pytest
@@ -50,8 +49,8 @@ from xop_lerobot.evaluation.bench import (
     move_from,
 )
 from xop_lerobot.morphology.morphology import make_morphology
+from xop_lerobot.retarget.arms.contact import ArmHold
 from xop_lerobot.retarget.config import RetargeterConfig
-from xop_lerobot.retarget.guidance.guidance import Guidance
 
 HOME = make_pose(np.array([1.0, 2.0, 1.25]), quat_from_yaw(0.7))
 DT = 0.04
@@ -388,10 +387,10 @@ def test_each_ablation_changes_something_of_some_robot(name):
 
 
 def test_parts_without_a_setting_are_replaced_and_put_back():
-    stock = Guidance._drives
-    with ABLATIONS["no_route"].replace():
-        assert not Guidance._drives(cast("Guidance", None), Mode.MOBILE)
-    assert Guidance._drives is stock
+    stock = ArmHold.update
+    with ABLATIONS["no_hold"].replace():
+        assert ArmHold.update is not stock
+    assert ArmHold.update is stock
     for ablation in ABLATIONS.values():  # a name that has moved is an error here
         with ablation.replace():
             pass

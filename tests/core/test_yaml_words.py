@@ -264,8 +264,8 @@ def test_pairs_of_settings():
     assert read_weights(["position=1e-1", "stance=1e1", "collision_range=inf"]) == {
         "position": 0.1, "stance": 10.0, "collision_range": math.inf,
     }  # fmt: skip
-    assert parse_overrides(["temperature=1e-3", "observe_drift=off", "shift=one"]) == {
-        "temperature": 0.001, "observe_drift": False, "shift": "one",
+    assert parse_overrides(["temperature=1e-3", "sample_plan=off", "shift=one"]) == {
+        "temperature": 0.001, "sample_plan": False, "shift": "one",
     }  # fmt: skip
     pairs = ["sync=off", "control_hz=1e1", "variant=007"]
     assert read_settings(RetargeterConfig, "retargeter", pairs) == {

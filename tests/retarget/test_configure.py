@@ -273,7 +273,7 @@ def test_without_the_observers_nothing_that_they_knew_is_left(bench):
     for _ in range(10):
         bench.tick(goal)
     assert retargeter.drift.drift.any()
-    retargeter.configure(bench.replace(observe_drift=False))
+    retargeter.configure(bench.replace(aids=()))
     bench.tick(goal)
     np.testing.assert_array_equal(retargeter.drift.drift, 0)
     np.testing.assert_array_equal(retargeter.offset.offset, 0)

@@ -78,6 +78,8 @@ def make_evaluation(seed: int = 0, **fields) -> Evaluation:
         "upright": ("left_wrist",),
         "drives": True,
         "balance": None,
+        "extrapolates": True,
+        "scale_control": True,
     }
     names = {field.name for field in dataclasses.fields(Evaluation)}
     return Evaluation(**{name: (values | fields)[name] for name in names})
@@ -221,6 +223,12 @@ def test_control_equals_its_formula():
         for i in range(K)
     ]
     np.testing.assert_allclose(ControlCost(scale).compute(e), expected)
+
+
+def test_control_in_the_entries_own_units_is_the_papers_energy():
+    e = make_evaluation(scale_control=False, reference=np.zeros(NA))
+    expected = WEIGHTS.control * np.square(np.linalg.norm(e.commands, axis=2)).mean(axis=1)
+    np.testing.assert_allclose(ControlCost(np.array([0.1, 1.0, 2.0])).compute(e), expected)
 
 
 def test_the_reference_costs_nothing():

@@ -280,6 +280,20 @@ def test_what_cannot_be_avoided_is_braked_for():
     driver.close()
 
 
+def test_without_the_intervention_the_plan_stays_and_its_risk_is_still_told():
+    driver = Driver(1.0)
+    bare = {
+        mode: dataclasses.replace(config, aids=tuple(set(config.aids) - {"intervention"}))
+        for mode, config in driver.retargeter.configs.items()
+    }
+    driver.retargeter.configure(bare)
+    free, plan = driver.plan(5.0), driver.plan(0.04)
+    assert plan.health["intervention"] == Intervention.NONE
+    assert plan.health["risk"] == pytest.approx(1.0)
+    np.testing.assert_array_equal(plan.commands, free.commands)
+    driver.close()
+
+
 def lean(morphology, roll: float) -> np.ndarray:
     qpos = morphology.standing_qpos()
     qpos[2] -= 0.05

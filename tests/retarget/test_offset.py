@@ -190,7 +190,7 @@ def lean(observe: bool) -> tuple[float, float]:
     )
     retargeter.configure(
         {
-            mode: dataclasses.replace(config, observe_drift=observe)
+            mode: dataclasses.replace(config, aids=config.aids if observe else ())
             for mode, config in retargeter.configs.items()
         }
     )

@@ -13,6 +13,7 @@ KERNEL_MEANS = ("hold", "zero")
 SHIFTS = ("measured", "one")
 CANDIDATES = ("proposal", "paced", "direct", "previous", "stop")
 CONTROL_REFERENCES = ("proposal", "neutral", "zero")
+AIDS = ("drift", "offset", "postures", "route", "sway", "intervention")
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class CostWeights:
         collision_velocity_decay: β, decay of the speed's term with the distance [1/m].
         collision_range: Distance from which an obstacle costs nothing; may be infinite [m].
         upright: Squared tilt of each hand under the upright constraint [1].
-        control: w_a, squared deviation of the command from its reference, in half ranges [1].
+        control: w_a, squared deviation of the command from its reference, in half ranges [1], or in
+            the entries' own units (`MpcConfig.scale_control`).
         change: Squared change of the command from the executed one, in half ranges [1].
         terminal: w_f, factor on the tracking cost at the end of the extrapolation [1].
         support: Squared distance of the centre of mass beyond the safe support area [1/m²].
@@ -95,8 +97,13 @@ class MpcConfig:
             `previous` (executed) command; and `stop`.
         control_reference: Command of zero control cost: the `proposal`, `neutral`, or `zero` as in
             the paper.
-        observe_drift: Whether the drift of a walking base and the steady-state offsets of height
-            and joints are observed and compensated.
+        scale_control: Whether the control cost measures each entry in half its range, or, as in the
+            paper, in its own unit.
+        aids: Parts around the optimisation that the paper does not have: `drift` of a walking base
+            and steady-state `offset` of height and joints, observed and compensated; `postures`,
+            which limit the head's goal to what the robot can reach; the `route` of a wheeled base,
+            with its heading; `sway`, small velocities that shift the weight of a standing robot;
+            and the `intervention`, which slows down or vetoes a plan.
         weights: Cost weights.
     """
 
@@ -123,7 +130,8 @@ class MpcConfig:
     reach: float = 0.6
     candidates: tuple[str, ...] = ("proposal", "previous", "stop")
     control_reference: str = "proposal"
-    observe_drift: bool = True
+    scale_control: bool = True
+    aids: tuple[str, ...] = AIDS
     weights: CostWeights = field(default_factory=CostWeights)
 
     def __post_init__(self) -> None:
@@ -136,9 +144,13 @@ class MpcConfig:
         ):
             if getattr(self, name) not in known:
                 raise UnknownName(name, getattr(self, name), known)
-        for name in self.candidates:
-            if name not in CANDIDATES:
-                raise UnknownName("candidate", name, CANDIDATES)
+        for what, names, known in (
+            ("candidate", self.candidates, CANDIDATES),
+            ("aid", self.aids, AIDS),
+        ):
+            for name in names:
+                if name not in known:
+                    raise UnknownName(what, name, known)
         for name in ("num_samples", "horizon", "num_knots", "effective_samples"):
             _check_range(name, getattr(self, name), 1)
         for name in ("num_samples", "horizon", "num_knots"):

@@ -227,6 +227,12 @@ class Verdict(NamedTuple):
     sample: int | None = None
     scale: float = 1.0
 
+    def keep_plan(self) -> Verdict:
+        """The same risk without an intervention, unless no prediction is finite."""
+        if self.intervention is Intervention.DIVERGED:
+            return self
+        return Verdict(Intervention.NONE, self.risk)
+
 
 def judge(
     weights: np.ndarray, costs: np.ndarray, falls: np.ndarray, touches: np.ndarray, stop: int | None

@@ -168,6 +168,7 @@ class MpcRetargeter(Retargeter):
                 self.constraints = constraints
             if body is not None and not np.array_equal(mask, self.command_model.body):
                 self.command_model.body, self._last = mask, None
+            self.command_model.sways = "sway" in new[Mode.STATIONARY].aids
             sites = {name: frames[name] for name in self.frames}
             hands = {arm.frame for arm in self.morphology.arms}
             upright = tuple(hands & set(sites)) if "upright" in self.constraints else ()
@@ -252,6 +253,8 @@ class MpcRetargeter(Retargeter):
         # Execute the weighted mean unless it is likely to fall or collide.
         stop = _find_stop(config, len(commands))
         verdict = judge(weights, scores.costs, scores.falls, scores.touches, stop)
+        if "intervention" not in config.aids:
+            verdict = verdict.keep_plan()
         self._apply(verdict, optimizer, samples.commands, now)
         planned = self._hold(optimizer.commands, now, mode, proposal)
         planned = self.problem.restrict(planned, mode)
@@ -270,9 +273,10 @@ class MpcRetargeter(Retargeter):
     def _observe(self, state: RobotState, mode: Mode, config: MpcConfig) -> PlannerState:
         """Update the observers; returns the state that all parts of the solve start from."""
         executed = self.decision.join(state.command, state.arms)
-        observes = config.observe_drift
-        self.drift.update(state.time, state.qpos, executed, observes and mode is Mode.MOBILE)
-        self.offset.update(state.time, state.qpos, executed, learns=observes)
+        drifts = mode is Mode.MOBILE and "drift" in config.aids
+        self.drift.update(state.time, state.qpos, executed, drifts)
+        learns = "offset" in config.aids
+        self.offset.update(state.time, state.qpos, executed, learns=learns)
         return PlannerState(
             qpos=state.qpos,
             executed=executed,

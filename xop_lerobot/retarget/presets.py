@@ -105,7 +105,7 @@ def _make_table1(morphology: Morphology, config: MpcConfig, paper: PaperParamete
         extrapolation_s=0.0,
         candidates=(),
         control_reference="zero",
-        observe_drift=False,
+        aids=("postures", "route", "sway", "intervention"),
         reach=_UNLIMITED,
         weights=_PAPER_WEIGHTS,
     )

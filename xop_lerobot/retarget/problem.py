@@ -203,6 +203,8 @@ class Problem:
             upright=tuple(name for name in reference.upright if name in sites),
             drives=bool((decided & model.is_velocity()).any()),
             balance=reference.balance,
+            extrapolates=config.extrapolation_s > 0,
+            scale_control=config.scale_control,
         )
 
     def score(self, evaluation: Evaluation) -> Scores:

@@ -135,8 +135,9 @@ class References:
     def serve(
         self, state: PlannerState, goal: Goal, config: MpcConfig
     ) -> tuple[Goal, Served | None]:
-        """Limit the goal to what the robot can reach, and find the posture for it."""
-        if HEAD not in self.sites or HEAD not in goal.poses:
+        """Limit the goal to what the robot can reach, and find its posture, if `config` says so."""
+        used = "postures" in config.aids
+        if not used or HEAD not in self.sites or HEAD not in goal.poses:
             return goal, None
         goal = self.postures.hold(goal, state, config.preview_s)
         then = preview(goal, (HEAD,), np.array([config.proposal_s]), config.preview_s)[HEAD][0]

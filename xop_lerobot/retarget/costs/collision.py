@@ -78,7 +78,7 @@ class CollisionCost(Cost):
         ) + weights.collision_velocity * speed * _compute_barrier(
             distances, weights.collision_velocity_decay, weights.collision_range
         )
-        return barrier[:, :-1].mean(axis=1) + barrier[:, -1]
+        return barrier[:, :-1].mean(axis=1) + evaluation.extrapolates * barrier[:, -1]
 
     def find_touches(self, evaluation: Evaluation) -> np.ndarray:
         """Mask of the samples that touch an obstacle more deeply than the start. (K,), bool."""

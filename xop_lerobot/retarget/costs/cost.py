@@ -42,6 +42,8 @@ class Evaluation:
         balance: Desired rest position of the centre of mass on the base, of robots with a support
             area; None for that of the standing robot. Shape (2,).
         drives: Whether any free entry moves the base over the ground.
+        extrapolates: Whether the end of the extrapolation is later than the last step.
+        scale_control: Whether the control cost measures each entry in half its range.
     """
 
     qpos: np.ndarray
@@ -65,6 +67,8 @@ class Evaluation:
     upright: tuple[str, ...] = ()
     drives: bool = True
     balance: np.ndarray | None = None
+    extrapolates: bool = True
+    scale_control: bool = True
 
 
 class Cost(ABC):

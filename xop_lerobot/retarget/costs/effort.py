@@ -9,10 +9,10 @@ from xop_lerobot.retarget.costs.cost import Cost, Evaluation
 
 
 class ControlCost(Cost):
-    r"""Mean over steps of :math:`w_a\|(a_k - a_{ref})/s\|^2`, s half the range of each entry.
+    r"""Mean over steps of :math:`w_a\|(a_k - a_{ref})/s\|^2`, s half the range of each entry, or 1.
 
-    With the paper's absolute command (a reference of zero) the term would pull a standing height
-    towards zero; with the kinematic proposal as reference only deviations from it cost.
+    With the paper's absolute command (a reference of zero, s = 1) the term would pull a standing
+    height towards zero; with the kinematic proposal as reference only deviations from it cost.
 
     Args:
         scale: Half the range of each command entry. Shape (k,).
@@ -25,7 +25,9 @@ class ControlCost(Cost):
 
     def compute(self, evaluation: Evaluation) -> np.ndarray:
         """Cost of every sample. Shape (K,)."""
-        effort = (evaluation.commands - evaluation.reference) / self.scale
+        effort = evaluation.commands - evaluation.reference
+        if evaluation.scale_control:
+            effort = effort / self.scale
         return evaluation.weights.control * sum_squares(effort).mean(-1)
 
 

@@ -86,8 +86,9 @@ class UprightCost(Cost):
         total = np.zeros(len(evaluation.qpos))
         for name in evaluation.upright:
             sign = compute_side(evaluation.terminal_goals[name])
-            moving = compute_upright(evaluation.poses[name][:, 1:], sign).mean(axis=1)
-            total += moving + compute_upright(evaluation.terminal_poses[name], sign)
+            total += compute_upright(evaluation.poses[name][:, 1:], sign).mean(axis=1)
+            if evaluation.extrapolates:
+                total += compute_upright(evaluation.terminal_poses[name], sign)
         return evaluation.weights.upright * total
 
 

@@ -159,7 +159,7 @@ class Guidance:
         times, poses = compute_times(config), state.poses
         ahead = {} if served is None else {HEAD: served.ahead}
         name = next((name for name in poses if name in goal.poses), None)
-        drives = name is not None and self._drives(goal.mode)
+        drives = name is not None and "route" in config.aids and self._drives(goal.mode)
         if name is not None and drives and not is_moving(goal, name):
             return self._lead_along_route(state, goal, name, times, config, ahead)
         near = hold_near(goal, poses, config.reach)

@@ -141,13 +141,9 @@ class CommandModel:
         self._lag = np.array([effect.lag_s for effect in effects])
         self._gazes = [(i, effect.gaze) for i, effect in enumerate(effects) if effect.gaze]
         self.neck = np.array([effect.neck for effect in effects])
-        self._modes = {
-            mode: np.array([mode in effect.modes for effect in effects])
-            & ~(space.mobile_only & (space.sway == 0) & (mode == Mode.STATIONARY))
-            for mode in Mode
-        }
         self._sway = np.array([effect.sway_s for effect in effects])
-        self.body = np.ones(len(space), dtype=bool)
+        self._sways, self._body = True, np.ones(len(space), dtype=bool)
+        self._find_acting()
 
     @property
     def body(self) -> np.ndarray:
@@ -158,7 +154,28 @@ class CommandModel:
     def body(self, mask: np.ndarray) -> None:
         self._body = np.array(mask, dtype=bool)
         self._body.setflags(write=False)
-        self._acting = {mode: acts & self._body for mode, acts in self._modes.items()}
+        self._find_acting()
+
+    @property
+    def sways(self) -> bool:
+        """Whether velocities may shift the weight of a standing robot; initially true."""
+        return self._sways
+
+    @sways.setter
+    def sways(self, sways: bool) -> None:
+        self._sways = sways
+        self._find_acting()
+
+    def _find_acting(self) -> None:
+        """Find the free entries that have an effect in each mode."""
+        shifts = (self.space.sway > 0) & self._sways
+        still = self.space.mobile_only & ~shifts
+        self._acting = {
+            mode: self._body
+            & np.array([mode in effect.modes for effect in self.effects])
+            & ~(still & (mode is Mode.STATIONARY))
+            for mode in Mode
+        }
         self._following = {
             mode: np.flatnonzero(acting & self._follows[mode])
             for mode, acting in self._acting.items()
