@@ -369,7 +369,7 @@ def test_each_ablation_runs_its_own_settings_and_nothing_else_differs(robot, nam
             # Some may be that of the default already.
             assert fields <= {entry.partition(".")[0] for entry in ablation.mpc}
         else:
-            assert {"weighting", "importance_cost", "weights", "candidates"} <= fields
+            assert {"weighting", "weights", "candidates", "aids"} <= fields
             for entry, value in ablation.mpc.items():
                 assert getattr(own[mode], entry) == value
         make = make_tuned_morphology(setup)

@@ -324,7 +324,11 @@ def test_the_command(server, capsys):
         (("--weights", "position"), "--weights takes name=value, got 'position'"),
         (("--weights", "position=two"), "weight 'position' must be a number, got 'two'"),
         (("--constraints", "upright=2"), "constraint 'upright' must be on or off, got '2'"),
-        (("--preset", "x"), "unknown preset 'x'. Known: aggressive, conservative, default, table1"),
+        (
+            ("--preset", "x"),
+            "unknown preset 'x'. Known: "
+            "aggressive, conservative, default, table1, table1_charitable",
+        ),
     ],
 )
 def test_mistakes_of_the_command_are_one_line(server, flags, error):

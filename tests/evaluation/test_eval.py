@@ -153,6 +153,11 @@ def test_methods_and_variants():
     assert (config.threads, config.seed) == (1, 3)
     assert make_retargeter_config(g1, "direct").type == "direct"
     assert make_retargeter_config(g1, "mpc_table1").preset == "table1"
+    charitable = make_retargeter_config(g1, "mpc_table1_charitable")
+    assert charitable.preset == "table1_charitable"
+    for variant in ("v2_table1_charitable", "table1_charitable_v2"):  # one name, not two parts
+        parsed = parse_variant(rby1, variant)
+        assert parsed == {"variant": "v2", "preset": "table1_charitable"}
     with pytest.raises(UnknownName, match="unknown part of variant 'v2_x' of rby1 'x'. Known: agg"):
         parse_variant(rby1, "v2_x")
     with pytest.raises(BadValue, match="variant 'v1_v2' has two bindings: v1, v2. Choose one"):

@@ -251,7 +251,7 @@ BAD_FLAGS = {
     "--teleop.device.hold_s=-1": "device.hold_s must be finite and at least 0, got -1.0",
     "--teleop.device.mode=fly": "unknown device.mode 'fly'. Known: mobile, stationary",
     "--teleop.retargeter.preset=fast": (
-        "unknown preset 'fast'. Known: aggressive, conservative, default, table1"
+        "unknown preset 'fast'. Known: aggressive, conservative, default, table1, table1_charitable"
     ),
     "--teleop.gestures.both_double_pinch=wave": (
         "unknown gestures.both_double_pinch 'wave'. Known: aggressive, conservative, default, none"

@@ -20,8 +20,10 @@ from xop_lerobot.core.transforms import (
     quat_rotate,
 )
 from xop_lerobot.morphology.contacts import Feet, Wheels
+from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.morphology.tuning import CostWeights
 from xop_lerobot.recording.columns import COST_NAMES
+from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.costs import (
     COSTS,
     CollisionCost,
@@ -38,6 +40,7 @@ from xop_lerobot.retarget.costs import (
 )
 from xop_lerobot.retarget.costs.balance import compute_facing
 from xop_lerobot.retarget.obstacles import Obstacle
+from xop_lerobot.retarget.presets import build_configs
 
 K, H, NQ, NV, NA = 5, 4, 9, 8, 3
 SITES = ("a", "b", "c")
@@ -376,6 +379,37 @@ def test_costs_are_finite_positive_and_proportional_to_their_weight(cost):
     np.testing.assert_allclose(cost.compute(make_evaluation(weights=weights)), 2 * value)
     nothing = CostWeights(**{name: 0.0 for name in doubled})
     np.testing.assert_array_equal(cost.compute(make_evaluation(weights=nothing)), np.zeros(K))
+
+
+def test_the_costs_of_table1_are_the_papers_by_the_letter():
+    r"""H times their total is :math:`\sum_k l(x_k, a_k) + V_f(x_H)` of Eqs. 1a and 3."""
+    morphology = make_morphology("rby1")
+    settings = RetargeterConfig(preset="table1", num_samples=K)
+    config = build_configs(morphology, settings)[Mode.STATIONARY]
+    w = dataclasses.replace(config.weights, terminal=1.0 / H)  # H of this batch, not Table I's
+    e = make_evaluation(
+        weights=w, reference=np.zeros(NA), upright=(),
+        scale_control=config.scale_control, extrapolates=config.extrapolation_s > 0,
+    )  # fmt: skip
+    last = {name: poses[:, -1] for name, poses in e.poses.items()}
+    ends = {name: goals[-1] for name, goals in e.goals.items()}
+    e = dataclasses.replace(e, terminal_poses=last, terminal_goals=ends)
+    distances = CollisionCost((BOX,), {"a": 0.1}).obstacles.compute_distances
+
+    def track(i: int, k: int) -> float:
+        return sum(compute_pose_cost(e.poses[n][i, k], e.goals[n][k], w) for n in e.goals)
+
+    def run(i: int, k: int) -> float:
+        gap = float(distances(e.points["a"][i, k][None])[0, 0]) - 0.1
+        speed = np.square(e.qvel[i, k, :2]).sum()
+        moved = sum(np.square(e.velocities[site][i, k]).sum() for site in ("a", "b"))
+        energy = np.square(e.commands[i, k - 1]).sum()
+        collision = math.exp(-1.0 * gap) + speed * math.exp(-10.0 * gap)
+        return track(i, k) + 0.1 * moved + collision + 0.1 * energy
+
+    expected = [sum(run(i, k) for k in range(1, H + 1)) + track(i, H) for i in range(K)]
+    total = sum(cost.compute(e) for cost in ALL)
+    np.testing.assert_allclose(H * total, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.4])

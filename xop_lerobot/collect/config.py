@@ -213,7 +213,7 @@ def add_config(
     add("width", "image width [pixel]", type=int)
     add("height", "image height [pixel]", type=int)
     add("noise", "sensor noise: off, mild or harsh")
-    add("method", "mpc, mpc_no_sync, mpc_table1, direct or direct_amo")
+    add("method", "mpc, mpc_no_sync, mpc_table1, mpc_table1_charitable, direct or direct_amo")
     add("variant", "binding, constraints and preset joined by _, such as v2_upright")
     add("scene", "scene; empty: the task's own")
     add("heights", "heights that override the task's, such as support=0.35,table=0.6:0.7 [m]")

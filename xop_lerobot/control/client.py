@@ -21,6 +21,7 @@ from xop_lerobot.control.protocol import MAX_LINE, find_socket, read_object, wri
 from xop_lerobot.core.command_line import make_output_readable, split_pair
 from xop_lerobot.core.errors import BadValue, XopError
 from xop_lerobot.core.paced_log import PacedLog
+from xop_lerobot.retarget.config import PRESETS
 
 _SWITCH = {"on": True, "true": True, "yes": True, "off": False, "false": False, "no": False}
 
@@ -128,7 +129,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--session", default="default", help="--teleop.session of the session")
     parser.add_argument("--socket", default="true", help="--teleop.control of the session")
-    parser.add_argument("--preset", help="default, conservative, aggressive or table1")
+    parser.add_argument("--preset", help=f"one of {', '.join(PRESETS)}")
     parser.add_argument("--weights", nargs="+", metavar="NAME=VALUE", help="cost weights")
     parser.add_argument("--constraints", nargs="+", metavar="NAME=on|off", help="such as upright")
     parser.add_argument("--variant", help="named binding of the robot, such as v2")

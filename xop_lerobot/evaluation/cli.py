@@ -42,8 +42,8 @@ def make_parser() -> CommandParser:
         "--variant and --low-level then select from it (default: none)")  # fmt: skip
     add("--robot", type=read_robot, help=say_robots())
     add("--task", help="dual_point_touch, box_pick_and_place or non_prehensile_transport")
-    add("--methods", help="methods, comma-separated: mpc, mpc_no_sync, mpc_table1, direct, "
-        "direct_amo (default: mpc,direct)")  # fmt: skip
+    add("--methods", help="methods, comma-separated: mpc, mpc_no_sync, mpc_table1, "
+        "mpc_table1_charitable, direct, direct_amo (default: mpc,direct)")  # fmt: skip
     add("--variant", help="variants of the methods, comma-separated; each joins a binding of the "
         "robot (v1, v2), upright and a preset (conservative, aggressive) by underscores, "
         "such as v2_upright (default: the robot's own)")  # fmt: skip

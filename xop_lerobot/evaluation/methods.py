@@ -6,7 +6,8 @@ the robot names, constraints and a preset, joined by underscores (`v2_upright_co
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,7 +35,10 @@ class Method:
 METHODS: dict[str, Method] = {
     "mpc": Method("MPC retargeter"),
     "mpc_no_sync": Method("MPC, raw measurements into the planner", {"sync": False}),
-    "mpc_table1": Method("MPC with the paper's Table I", {"preset": "table1"}),
+    "mpc_table1": Method("MPC with the paper's Table I, literally", {"preset": "table1"}),
+    "mpc_table1_charitable": Method(
+        "MPC with the paper's Table I, charitably", {"preset": "table1_charitable"}
+    ),
     "direct": Method("Direct mapping", {"type": "direct"}),
     "direct_amo": Method("Direct mapping with AMO", {"type": "direct"}, low_level="amo"),
 }
@@ -67,7 +71,7 @@ def parse_variant(morphology: Morphology, variant: str) -> dict[str, str]:
         BadValue: If there are two bindings or two presets.
     """
     bindings, constraints, presets = [], [], []
-    for part in variant.split("_") if variant else ():
+    for part in _split(variant, (*morphology.variants, *CONSTRAINTS, *PRESETS)):
         if part in morphology.variants:
             bindings.append(part)
         elif part in CONSTRAINTS:
@@ -86,6 +90,12 @@ def parse_variant(morphology: Morphology, variant: str) -> dict[str, str]:
         "preset": "".join(presets),
     }
     return {name: value for name, value in found.items() if value}
+
+
+def _split(variant: str, known: Iterable[str]) -> list[str]:
+    """Split at underscores, except within a known name."""
+    longest = "|".join(re.escape(name) for name in sorted(known, key=len, reverse=True))
+    return re.findall(rf"(?:{longest})(?=_|$)|[^_]+", variant)
 
 
 def make_retargeter_config(

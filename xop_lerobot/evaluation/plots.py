@@ -21,6 +21,7 @@ COLOURS = {
     "mpc": "#2166ac",
     "mpc_no_sync": "#92c5de",
     "mpc_table1": "#9970ab",
+    "mpc_table1_charitable": "#c2a5cf",
     "direct": "#d6604d",
     "direct_amo": "#b2182b",
 }

@@ -10,7 +10,7 @@ from xop_lerobot.core.yaml_words import fill_nulls, find_text
 from xop_lerobot.morphology.tuning import MpcConfig
 
 RETARGETERS = ("mpc", "direct")
-PRESETS = ("default", "conservative", "aggressive", "table1")
+PRESETS = ("default", "conservative", "aggressive", "table1", "table1_charitable")
 CONSTRAINTS = ("upright",)
 """Constraints that can be switched on and off while the robot is driven."""
 
@@ -26,7 +26,8 @@ class RetargeterConfig:
         control_hz: Solves per second; 0 takes the robot's own default.
         threads: Threads for the rollouts; 0 takes one per core.
         seed: Seed of the samples.
-        preset: Settings to start with: `default`, `conservative`, `aggressive` or `table1`.
+        preset: Settings to start with: `default`, `conservative`, `aggressive`, `table1` or
+            `table1_charitable`.
         sync: Whether to synchronise the measured state with the ground contacts before each tick.
         variant: Initial binding of targets to the body, one that the robot names (RB-Y1: `v1`,
             `v2`); empty takes its first.
