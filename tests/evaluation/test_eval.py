@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import time
+from dataclasses import replace
 
 import pytest
 from eval_jobs import do, make_trial, run_made
@@ -137,6 +138,13 @@ def test_summary_of_hand_made_trials():
     assert row["ct_mean"] == pytest.approx(10.5) and row["ct_std"] == pytest.approx(0.5)
     assert row["abp_mean"] == pytest.approx(0.2)
     assert row["tilt_mean"] is None and row["jerk_mean"] == 10
+    assert (row["completed"], row["ct_any_mean"]) == (None, None)  # no trial goes on beyond
+    beyond = replace(SETUP, time_limit=300.0)
+    late = make_trial(beyond, 2, success=False, completion_s=200.0)
+    never = make_trial(beyond, 3, success=False, completion_s=None)
+    row = summarise(Cell(beyond, 3), [make_trial(beyond, 0), late, never])
+    assert (row["success"], row["ct_mean"]) == (1, 10.0)
+    assert (row["completed"], row["ct_any_mean"], row["ct_any_std"]) == (2, 105.0, 95.0)
     empty = summarise(Cell(SETUP, 3, absence="weights not present: x"), [])
     assert empty["trials"] == 0 and empty["ct_mean"] is None
     assert empty["note"] == "weights not present"

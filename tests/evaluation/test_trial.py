@@ -18,6 +18,7 @@ from xop_lerobot.evaluation.trial_metrics import (
 )
 from xop_lerobot.morphology.morphology import make_morphology
 from xop_lerobot.plant.rendering import RenderingUnavailable
+from xop_lerobot.tasks.task import TASKS
 
 DIRECT = TrialSetup("g1", "dual_point_touch", "direct", time_limit=3.0)
 
@@ -72,6 +73,29 @@ def test_what_a_trial_keeps(trial):
     assert np.isnan(metrics["tilt"]) and metrics["touch_s"] == 0
     record = json.loads(json.dumps(make_record(trial), allow_nan=False))
     assert record["completion_s"] is None and record["seed"] == 3
+
+
+@pytest.mark.parametrize(
+    "at, success, ever", [(5, True, True), (15, False, True), (99, False, False)]
+)
+def test_beyond_the_tasks_limit_only_the_completion_time_is_measured(
+    monkeypatch, at, success, ever
+):
+    monkeypatch.setattr(TASKS[DIRECT.task], "time_limit", 0.4)
+    ticks = 0
+
+    def watch(stage, view, tick):
+        nonlocal ticks
+        ticks += 1
+        stage.task._success |= ticks == at
+
+    trial = run_trial(replace(DIRECT, time_limit=0.8), 3, watch)
+    assert trial.status.success == success
+    # The person engages in the first tick. After a success an episode goes on for a second.
+    assert trial.completion_s == pytest.approx(0.04 * at) if ever else np.isnan(trial.completion_s)
+    assert ticks == at + 25 if ever else 20
+    assert len(trial.trace.time) == (ticks if success else 10)
+    assert len(trial.film.qpos) == ticks
 
 
 def test_power_counts_legs_and_waist_alone():

@@ -139,7 +139,7 @@ def test_a_break_starts_the_three_seconds_anew(rby1):
 
 
 def test_over_when_time_is_up(rby1, monkeypatch):
-    monkeypatch.setattr(type(rby1.task), "time_limit", 0.5)
+    monkeypatch.setattr(rby1, "time_limit", 0.5)
     reset(rby1, 0)
     run(rby1, 0.46)
     assert not rby1.status.done

@@ -59,7 +59,8 @@ def make_parser() -> CommandParser:
         "points=0.3:0.5 [m] (default: the task's own)")  # fmt: skip
     add("--fps", type=int, help="rate of the control loop, divides 50 [Hz] (default: 25)")
     add("--time-limit", type=float,
-        help="time limit of an episode [s] (default: the task's own)")  # fmt: skip
+        help="time after which a trial ends [s]; beyond the task's own limit it has failed, and "
+        "only its completion time is still measured (default: the task's own limit)")  # fmt: skip
     add("--workers", type=int, default=0, help="parallel processes; 0: cores (default: 0)")
     add("--out", type=Path, default=Path("outputs/eval"),
         help="folder of the results; a study resumes from it (default: outputs/eval)")  # fmt: skip
@@ -242,6 +243,8 @@ def describe_outcome(record: Mapping[str, Any]) -> str:
         text = f"success after {record['completion_s']:.1f} s"
     else:
         text = record["failure"] or "time is up"
+        if record["completion_s"] is not None:
+            text += f", success after {record['completion_s']:.1f} s"
     if record["collision"]:
         text += f", {len(record['collisions'])} collisions"
     return f"{text} ({record['sim_s']:.0f} s in {record['wall_s']:.0f} s)"
@@ -264,7 +267,7 @@ def _warn_of_mixture(found: Sequence[Sequence[Mapping[str, Any]]], folder: Path)
 def format_rows(rows: Sequence[Mapping[str, Any]]) -> str:
     """Format the rows as a table for a terminal."""
     head = ("robot", "task", "method", "low level", "success", "pickup", "collis.", "falls",
-            "CT [s]", "ABP [W]", "tilt [rad]", "jerk [m/s3]", "note")  # fmt: skip
+            "CT [s]", "CT, any [s]", "ABP [W]", "tilt [rad]", "jerk [m/s3]", "note")  # fmt: skip
     lines: list[tuple[str, ...]] = []
     for row in rows:
         trials = row["trials"]
@@ -277,6 +280,7 @@ def format_rows(rows: Sequence[Mapping[str, Any]]) -> str:
                 row["low_level"],
                 *counts,
                 format_spread(row["ct_mean"], row["ct_std"], 1),
+                format_any(row),
                 format_spread(row["abp_mean"], row["abp_std"], 2),
                 format_spread(row["tilt_mean"], row["tilt_std"], 2),
                 format_spread(row["jerk_mean"], row["jerk_std"], 0),
@@ -284,6 +288,14 @@ def format_rows(rows: Sequence[Mapping[str, Any]]) -> str:
             )
         )
     return format_table(head, lines)
+
+
+def format_any(row: Mapping[str, Any]) -> str:
+    """Completion time of all trials that ever succeed, and how many do; a dash if not measured."""
+    if row["completed"] is None:
+        return "-"
+    spread = format_spread(row["ct_any_mean"], row["ct_any_std"], 1)
+    return f"{spread} ({row['completed']}/{row['trials']})"
 
 
 def format_spread(mean: float | None, std: float | None, digits: int) -> str:

@@ -233,7 +233,8 @@ def collect(cell: Cell, records: Mapping[str, Mapping[str, Any]]) -> list[Mappin
 def summarise(cell: Cell, trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Make one row of the table: counts out of `trials`, means and standard deviations.
 
-    CT is over successful trials, everything else over all. A missing value is None.
+    CT is over successful trials, everything else over all. If trials go on beyond their task's time
+    limit, `completed` and `ct_any` are over those that ever succeed. A missing value is None.
     """
     setup = cell.setup
 
@@ -242,6 +243,8 @@ def summarise(cell: Cell, trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]
         return [value for value in found if value is not None]
 
     times = [trial["completion_s"] for trial in trials if trial["success"]]
+    ever = [trial["completion_s"] for trial in trials if trial["completion_s"] is not None]
+    beyond = setup.goes_beyond and bool(trials)
     row: dict[str, Any] = {
         "robot": setup.robot,
         "task": setup.task,
@@ -267,6 +270,10 @@ def summarise(cell: Cell, trials: Sequence[Mapping[str, Any]]) -> dict[str, Any]
         "tilt_std": _std(values("tilt")),
         "jerk_std": _std(values("jerk")),
         "abp_signed_mean": _mean(values("abp_signed")),
+        "time_limit": setup.time_limit,
+        "completed": len(ever) if beyond else None,
+        "ct_any_mean": _mean(ever) if beyond else None,
+        "ct_any_std": _std(ever) if beyond else None,
     }
     for name in ("head_error", "hands_error", "roughness", "slip", "plan_ms", "plan_p99_ms"):
         row[f"{name}_mean"] = _mean(values(name))
@@ -287,7 +294,7 @@ def _std(values: Sequence[float]) -> float | None:
 
 _STUDY_KEYS = ("trials", "seed", "noise", "fps", "time_limit", "low_level_paths", "groups")
 _LISTS = ("tasks", "methods", "variants", "low_levels")
-_GROUP_KEYS = ("robot", *_LISTS, "trials", "noise", "scene", "heights")
+_GROUP_KEYS = ("robot", *_LISTS, "trials", "noise", "scene", "heights", "time_limit")
 
 
 def load_study(path: Path, overrides: Mapping[str, Any] | None = None) -> list[Cell]:
@@ -297,8 +304,8 @@ def load_study(path: Path, overrides: Mapping[str, Any] | None = None) -> list[C
         path: YAML file with `trials`, `seed`, `noise`, `fps`, `time_limit`, `low_level_paths` (file
             or folder by name of a low-level policy), and a list of `groups`. Each group has a
             `robot` and lists of `tasks` and `methods`; optional are lists of `variants` and
-            `low_levels`, and its own `trials`, `noise`, `scene` and `heights`. Every combination
-            within a group is a cell.
+            `low_levels`, and its own `trials`, `noise`, `scene`, `heights` and `time_limit`. Every
+            combination within a group is a cell.
         overrides: Values that replace those of the file and of all its groups (`trials`, `seed`,
             `noise`, …); None keeps a value.
 

@@ -32,8 +32,6 @@ from xop_lerobot.teleoperation import Teleoperation, TeleoperationConfig
 if TYPE_CHECKING:
     from xop_lerobot.tasks.stage import Stage
 
-GRACE_S = 5.0
-"""Time over its task's limit after which an episode is aborted [s]."""
 FILM_HZ = 25
 """Highest rate of recorded positions [Hz]."""
 
@@ -53,8 +51,8 @@ class TrialSetup:
         scene: Scene; empty for the task's own.
         heights: Heights that override the task's defaults; see `Task.choose_heights`.
         fps: Rate of the control loop [Hz].
-        time_limit: Time after which the episode is aborted, if its task has not ended it [s]; 0 for
-            the task's own limit.
+        time_limit: Time after which the trial ends [s]; 0 for the task's own limit. Beyond the
+            task's own it has failed, and only its completion time is still measured.
     """
 
     robot: str
@@ -73,6 +71,11 @@ class TrialSetup:
     def place(self) -> str:
         """The task, with its heights if not the default."""
         return f"{self.task} {self.heights}".strip()
+
+    @property
+    def goes_beyond(self) -> bool:
+        """Whether the trial goes on beyond its task's time limit."""
+        return self.time_limit > TASKS[self.task].time_limit
 
     @property
     def resolved(self) -> TrialSetup:
@@ -156,13 +159,14 @@ class Trial:
     Attributes:
         setup: Setup, with resolved names.
         seed: Seed of placement, person, sensors and samples.
-        status: Final status of the task.
-        completion_s: Time from the first engagement to success, nan without success [s].
+        status: Final status of the task, within its time limit.
+        completion_s: Time from the first engagement to success, also to one that comes after the
+            task's time limit; nan without any [s].
         sim_s: Simulated duration after settling [s].
         wall_s: Computing time on this machine [s].
-        fallen: Whether the robot fell.
-        trace: Trajectory.
-        film: Positions for rendering.
+        fallen: Whether the robot fell within the task's time limit.
+        trace: Trajectory within the task's time limit.
+        film: Positions for rendering, to the end.
     """
 
     setup: TrialSetup
@@ -266,7 +270,8 @@ def make_stage(setup: TrialSetup, seed: int) -> Stage:
     from xop_lerobot.tasks.stage import Stage  # noqa: PLC0415
 
     config = SimulationConfig(scene=setup.scene, noise=setup.noise, seed=seed)
-    return Stage(make_morphology(setup.robot), setup.task, config, setup.heights)
+    morphology = make_morphology(setup.robot)
+    return Stage(morphology, setup.task, config, setup.heights, setup.time_limit)
 
 
 @contextmanager
@@ -340,10 +345,14 @@ def _drive(
     begin: float,
     watch: Callable[[Stage, View, Tick], None] | None,
 ) -> Trial:
-    """Run the closed loop until the task is over."""
+    """Run the closed loop until the task is over.
+
+    Beyond the task's time limit only the completion time is measured.
+    """
     rows, filming = TraceRows(), _Filming(stage, setup.fps)
     dt, start = 1 / setup.fps, loop.state.time
-    limit = setup.time_limit or TASKS[setup.task].time_limit + GRACE_S
+    limit = TASKS[setup.task].time_limit
+    status, fallen, in_time = stage.status, False, True
     engaged_at = succeeded_at = float("nan")
     while True:
         state = loop.state
@@ -351,19 +360,23 @@ def _drive(
         action, tick = teleoperation.step(Tick(state, view=view))
         if tick.engaged and np.isnan(engaged_at):
             engaged_at = state.time
-        rows.add(tick, action.command)
+        if in_time:
+            rows.add(tick, action.command)
         filming.note()
         if watch is not None:
             watch(stage, view, tick)
         loop.execute(action, dt)
-        status = stage.update()
-        if status.success and np.isnan(succeeded_at):
+        now = stage.update()
+        if now.success and np.isnan(succeeded_at):
             succeeded_at = loop.state.time
-        gave_up = teleoperation.device.is_finished(loop.state.time) and not status.success
-        if status.done or gave_up or loop.state.time - start >= limit - dt / 2:
+        gave_up = teleoperation.device.is_finished(loop.state.time) and not now.success
+        if gave_up and not now.failure:
+            now = dataclasses.replace(now, failure="the person gave up")
+        if in_time:
+            status, fallen = now, loop.state.fallen
+            in_time = now.success or loop.state.time - start < limit - dt / 2
+        if now.done or gave_up:
             break
-    if gave_up and not status.failure:
-        status = dataclasses.replace(status, failure="the person gave up")
     return Trial(
         setup=setup,
         seed=seed,
@@ -371,7 +384,7 @@ def _drive(
         completion_s=succeeded_at - engaged_at,
         sim_s=loop.state.time - start,
         wall_s=perf_counter() - begin,
-        fallen=loop.state.fallen,
+        fallen=fallen,
         trace=rows.make_trace(),
         film=filming.make_film(),
     )

@@ -44,6 +44,7 @@ class Stage:
         config: Settings of the plant. If missing, or with an empty `scene`, the task's default
             scene is used.
         heights: Heights that override the task's defaults; see `Task.choose_heights`.
+        time_limit: Time after which an episode is over [s]; 0 for the task's own.
 
     Attributes:
         plant: The robot among the furniture.
@@ -62,8 +63,10 @@ class Stage:
         task: str,
         config: SimulationConfig | None = None,
         heights: str = "",
+        time_limit: float = 0.0,
     ) -> None:
         self.morphology, self.task = morphology, make_task(task, morphology, heights)
+        self.time_limit = time_limit or self.task.time_limit
         config = config or SimulationConfig(scene="")
         self.scene = find_scene(self.task, config.scene)
         spec = build_scene_spec(morphology, "full", self.scene)
@@ -166,7 +169,7 @@ class Stage:
         failed = bool(status.failure) and self._success_time is None
         if status.success and not failed and self._success_time is None:
             self._success_time = time
-        over = failed or self.time >= self.task.time_limit
+        over = failed or self.time >= self.time_limit - 1e-6
         won = self._success_time
         if won is not None:
             over = time - won >= AFTER_SUCCESS_S

@@ -49,7 +49,6 @@ class Person:
         heading_tolerance: Accepted error of the heading [rad].
         hand_tolerance: Accepted distance between palm and target point [m].
         corrections: Number of failed corrections after which another strategy is tried.
-        time_limit: Time after which the person gives up [s].
     """
 
     eye_height: float = 1.60
@@ -87,7 +86,6 @@ class Person:
     heading_tolerance: float = 0.12
     hand_tolerance: float = 0.028
     corrections: int = 6
-    time_limit: float = 150.0
 
     @property
     def size(self) -> float:
