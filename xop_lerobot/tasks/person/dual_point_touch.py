@@ -29,6 +29,8 @@ APPROACHES = 6
 """Number of approaches before giving up."""
 STANDOFF_STEP = 0.07
 """Change of the standing distance per approach: closer, or farther if arms were bent [m]."""
+ENOUGH = 6.0
+"""Time for which both palms seem to touch without success, until something must be wrong [s]."""
 LEAN_AFTER = 2
 """Number of unsuccessful corrections after which the person leans, unless bent."""
 
@@ -103,7 +105,8 @@ def plan_place(mind: Mind, closer: float = 0.0) -> np.ndarray:
 def hold_points(mind: Mind) -> Doing:
     """Reach both points and keep the palms there.
 
-    Returns when the task succeeds, or after `Person.corrections` corrections without progress.
+    Returns when the task succeeds, after `Person.corrections` corrections without progress, or if
+    nothing happens although both palms seem to touch.
     """
     points = get_points(mind)
     yield from take_posture(mind, plan_posture(mind, list(points.values())))
@@ -114,7 +117,7 @@ def hold_points(mind: Mind) -> Doing:
         quat = compute_pointing(mind, side, point)
         wrists[side] = compute_wrist(mind, side, point, quat)
     yield from reach(mind, wrists)
-    worst_ever, wasted = np.inf, 0
+    worst_ever, wasted, touching = np.inf, 0, np.inf
     while not mind.eyes.success:
         yield from mind.settle("left_palm", "right_palm")
         points = get_points(mind)
@@ -124,8 +127,12 @@ def hold_points(mind: Mind) -> Doing:
         unseen = [side for side in SIDES if not mind.eyes.sees(f"{side}_palm")]
         mind.note(f"palms {100 * worst:.1f} cm off" + f", {unseen} not seen" * bool(unseen))
         if worst <= mind.person.hand_tolerance:
+            touching = min(touching, mind.time)
+            if mind.time - touching > ENOUGH:
+                return
             yield from mind.pause(0.4)
             continue
+        touching = np.inf
         wasted = 0 if worst < 0.8 * worst_ever else wasted + 1
         worst_ever = min(worst, worst_ever)
         if wasted >= mind.person.corrections:
