@@ -48,12 +48,14 @@ class ToyWorld:
         lag: Time constant of all frames [s].
         drift: Velocity of the ground under a robot in mobile mode [m/s].
         deaf: How many gestures are not understood.
+        slide: Displacement of the robot each time it comes to stand [m].
     """
 
     objects: dict[str, SeenObject]
     lag: float = 0.3
     drift: tuple[float, float] = (0.0, 0.0)
     deaf: int = 0
+    slide: tuple[float, float] = (0.0, 0.0)
     task: str = "dual_point_touch"
     time: float = 0.0
     mode: Mode = Mode.STATIONARY
@@ -92,6 +94,10 @@ class ToyWorld:
                 self.deaf -= 1
             else:
                 self.mode = Mode(1 - self.mode)
+                if self.mode is Mode.STATIONARY:
+                    self._drifted[:2] += self.slide
+                    step = np.array([*self.slide, 0, 0, 0, 0, 0])
+                    self.frames = {name: pose + step for name, pose in self.frames.items()}
         self._follow(self._alignment.goal_poses(frame))
         self.time += DT
         return frame

@@ -73,6 +73,20 @@ def test_touches_both_points_whatever_the_robot_is_like(settings: dict) -> None:
     assert device.mind.diary[-1][1] == "done"
 
 
+@pytest.mark.parametrize("slide", [(-0.4, 0.1), (0.1, 0.35)])
+def test_aims_beyond_once_it_knows_that_the_robot_drifts(slide: tuple[float, float]) -> None:
+    world, device = ToyWorld(make_points(), slide=slide), make_person(3)
+    stood: list[np.ndarray] = []
+    while len(stood) < 2:  # it is never told of a success, so it approaches again
+        last = world.mode
+        world.step(device)
+        if last is Mode.MOBILE and world.mode is Mode.STATIONARY:
+            stood.append(world.frames["head"][:2])
+        assert world.time < 60
+    # Now it stands about where it would have the first time without the drift.
+    assert np.linalg.norm(stood[1] - (stood[0] - slide)) < 0.15
+
+
 @pytest.mark.slow
 def test_turns_round_for_what_is_behind() -> None:
     world, device = ToyWorld(make_points(bearing=2.8)), make_person(1)

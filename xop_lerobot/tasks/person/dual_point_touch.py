@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from xop_lerobot.core.command import Mode
-from xop_lerobot.core.transforms import compute_heading
+from xop_lerobot.core.transforms import compute_heading, quat_from_yaw, quat_rotate
 from xop_lerobot.tasks.person.body import SIDES
 from xop_lerobot.tasks.person.hands import (
     compute_bend,
@@ -38,7 +38,7 @@ LEAN_AFTER = 2
 def touch_two_points(mind: Mind) -> Doing:
     """Walk up to the points and hold both palms at them until the task succeeds."""
     yield from find(mind, *POINTS)
-    closer = 0.0
+    closer, slide = 0.0, np.zeros(2)
     for approach in range(APPROACHES):
         place = plan_place(mind, closer)
         miss, turn = compute_miss(mind, place)
@@ -46,10 +46,16 @@ def touch_two_points(mind: Mind) -> Doing:
         # trunk cannot lean. Later approaches follow a failure, so they must be precise.
         bends = compute_bend(mind, list(get_points(mind).values())) > 0
         near = mind.person.place_tolerance * (2.0 if not (approach or bends) else 0.5)
-        if miss > near or abs(turn) > mind.person.heading_tolerance:
+        walks = miss > near or abs(turn) > mind.person.heading_tolerance
+        if walks:
             yield from set_mode(mind, Mode.MOBILE)
+            place -= quat_rotate(quat_from_yaw(place[2]), np.array([*slide, 0.0]))
             yield from go_to(mind, place, tolerance=min(near, mind.person.place_tolerance))
         yield from set_mode(mind, Mode.STATIONARY)
+        yield from get_ready(mind)
+        if walks:  # a robot that drifts until it stands does so again: aim beyond next time
+            slide = mind.surprise
+            mind.note("it drifted by {:.0f}, {:.0f} cm".format(*100 * slide))
         yield from hold_points(mind)
         if mind.eyes.success:
             return
@@ -62,6 +68,7 @@ def reach_two_points(mind: Mind) -> Doing:
     """Hold both palms at points that are within reach, without walking."""
     yield from find(mind, *POINTS)
     for _ in range(APPROACHES):
+        yield from get_ready(mind)
         yield from hold_points(mind)
         if mind.eyes.success:
             return
@@ -102,14 +109,17 @@ def plan_place(mind: Mind, closer: float = 0.0) -> np.ndarray:
     )
 
 
+def get_ready(mind: Mind) -> Doing:
+    """Take the posture from which the hands reach both points."""
+    yield from take_posture(mind, plan_posture(mind, list(get_points(mind).values())))
+
+
 def hold_points(mind: Mind) -> Doing:
     """Reach both points and keep the palms there.
 
     Returns when the task succeeds, after `Person.corrections` corrections without progress, or if
     nothing happens although both palms seem to touch.
     """
-    points = get_points(mind)
-    yield from take_posture(mind, plan_posture(mind, list(points.values())))
     points = get_points(mind)
     mind.note("reach")
     wrists = {}

@@ -16,6 +16,7 @@ from xop_lerobot.core.transforms import (
     pose_multiply,
     quat_from_yaw,
     quat_multiply,
+    quat_rotate,
 )
 from xop_lerobot.operator.display import View
 from xop_lerobot.operator.frame import OperatorFrame
@@ -50,6 +51,9 @@ class Mind:
         self.body = Body(self.person, HumanNoise(int(sway.generate_state(1)[0]), noise))
         self.rng = np.random.default_rng(hand)
         self._belief: Belief | None = None
+        self.surprise = np.zeros(2)
+        """Position of the robot's head at the last look, relative to where it was believed to be,
+        along and across its heading [m]. Shape (2,)."""
         self.follows_head = True
         """Whether the person takes the robot's head for its own. False where only the hand counts
         and the planner may move the rest of the body."""
@@ -154,4 +158,7 @@ class Mind:
 
     def learn(self) -> None:
         """Correct the belief by where the robot's head is seen relative to the person's own."""
-        self.belief.learn(self.body.compute_head(), self.eyes.pose("head"), self.person.gain)
+        own, head = self.body.compute_head(), self.eyes.pose("head")
+        offset = head[:3] - self.belief.point_to_robot(own[:3], own)
+        self.surprise = quat_rotate(quat_from_yaw(-float(compute_heading(head[3:]))), offset)[:2]
+        self.belief.learn(own, head, self.person.gain)
