@@ -116,6 +116,7 @@ def test_columns_of_the_contract(session):
         "retargeter.cost": len(COST_NAMES),
         "retargeter.health": len(HEALTH_NAMES),
         "robot.base_pose": 7,
+        "robot.base_estimate": 7,
         "robot.head": 7,
         "robot.left_wrist": 7,
         "robot.right_wrist": 7,
@@ -790,6 +791,10 @@ def test_hardware_has_the_estimate_where_a_simulation_has_the_truth(session, pai
     real = Columns(dataclasses.replace(info, has_truth=False)).build_row(record)
     np.testing.assert_allclose(simulated["robot.base_pose"], state.true_qpos[:7], atol=1e-6)
     np.testing.assert_allclose(real["robot.base_pose"], estimate[:7], atol=1e-6)
+    for row in (simulated, real):  # the goals' world
+        np.testing.assert_allclose(row["robot.base_estimate"], estimate[:7], atol=1e-6)
+    measured = Columns(info).build_row(make_tick(state))["robot.base_estimate"]
+    np.testing.assert_allclose(measured, state.qpos[:7], atol=1e-6)
     assert real["robot.head"][0] == pytest.approx(simulated["robot.head"][0] + 0.01, abs=0.02)
 
 

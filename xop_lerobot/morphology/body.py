@@ -82,6 +82,10 @@ class Body:
         )
         return dict(zip(self.state_keys, values.tolist(), strict=True))
 
+    def get_base(self, qpos: np.ndarray) -> np.ndarray:
+        """Return the world pose of the base at `qpos`. Shape (7,)."""
+        return qpos[self._base_qpos : self._base_qpos + 7].copy()
+
     def compute_poses(self, qpos: np.ndarray) -> Mapping[str, np.ndarray]:
         """Return the world pose of `base_pose` and of every tracked frame at `qpos`. Shapes (7,).
 
@@ -89,7 +93,7 @@ class Body:
         """
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
-        poses = {"base_pose": qpos[self._base_qpos : self._base_qpos + 7].copy()}
+        poses = {"base_pose": self.get_base(qpos)}
         for frame, name in self._sites.items():
             site, quat = self._data.site(name), np.empty(4)
             mujoco.mju_mat2Quat(quat, site.xmat)

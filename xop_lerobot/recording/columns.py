@@ -61,6 +61,7 @@ class Columns:
             "retargeter.cost": _feature("float32", COST_NAMES),
             "retargeter.health": _feature("float32", HEALTH_NAMES),
             "robot.base_pose": _feature("float32", POSE_NAMES),
+            "robot.base_estimate": _feature("float32", POSE_NAMES),
             **{f"robot.{frame}": _feature("float32", POSE_NAMES) for frame in self._frames},
             "robot.effort": _feature("float32", effort),
             "time.sim": _feature("float64", ("s",)),
@@ -87,6 +88,9 @@ class Columns:
             "operator.engaged": tick.engaged,
             "retargeter.cost": _pick(COST_NAMES, tick.cost),
             "retargeter.health": _pick(HEALTH_NAMES, tick.health),
+            "robot.base_estimate": self._body.get_base(
+                state.qpos if tick.estimate is None else tick.estimate
+            ),
             "robot.effort": state.effort,
             "time.sim": state.time,
             "time.wall": round(state.wall_time * 1e9),
