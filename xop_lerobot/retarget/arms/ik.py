@@ -64,8 +64,8 @@ class ArmIk:
     Each solve starts from its own last solution, not from the measured arms, so that sensor noise
     and sag do not enter. Joint limits and a speed limit hold by construction. Elbows, forearms and
     hands keep a distance from the rest of the body and from each other (`Clearance`), up to the
-    servo lag. A weak posture task pulls towards the rest angles and keeps the elbows from drifting in
-    the null space.
+    servo lag. A weak posture task pulls towards the rest angles and keeps the elbows from drifting
+    in the null space.
 
     Args:
         morphology: The robot.
