@@ -1,12 +1,16 @@
 """Compare the planner's predictions from synchronised states with those from raw measurements.
 
     python -m benchmarks.run_sync --seeds 5 --duration 12 --noise mild
+    python -m benchmarks.run_sync --motions stand,walk_brisk --robots g1,rby1 --noise mild,off
 
 A robot stands, walks or drives in the simulated plant under noisy sensors. At every tick each
 variant of the synchronisation gets the same measurement. At every tenth tick the planner's
 prediction (planning model, low-level policy with the plant's memory) starts from each variant's
 state and from the true one. Printed are the RMS differences of the predicted base displacements
 after 60 and 200 ms, and the RMS errors of the states themselves.
+
+With `--motions`, a person does them in whole teleoperation in lock-step, whose own synchronisation
+is judged, from the beginning of the motion to its end.
 """
 
 from __future__ import annotations
@@ -14,26 +18,37 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import dataclass, field
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
+from benchmarks.motions import MOTIONS, START_S
+from benchmarks.run_motions import MotionDevice
 from xop_lerobot.core.command import Mode, RobotAction
 from xop_lerobot.core.command_line import make_output_readable
 from xop_lerobot.core.state import RobotState
 from xop_lerobot.core.transforms import quat_yaw, wrap_angle
+from xop_lerobot.evaluation.trial import closed_loop
 from xop_lerobot.low_level.factory import make_policy
 from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop
 from xop_lerobot.plant.simulation import Simulation, SimulationConfig
+from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.rollout import PolicyRollout
 from xop_lerobot.retarget.sync.config import SyncConfig
-from xop_lerobot.retarget.sync.state_sync import StateSync
+from xop_lerobot.retarget.sync.state_sync import StateSync, Synced
+from xop_lerobot.session import Tick
+from xop_lerobot.teleoperation import TeleoperationConfig
 
+TELEOPERATION = "synchronised"
+"""The state that teleoperation itself starts from, with `--motions`."""
 TICK = 0.04  # period of the teleoperation [s]
 HORIZONS = (3, 10)  # 60 and 200 ms [control steps]
 EVERY = 10  # ticks between predictions
+EVERY_IN_MOTIONS = 2  # the same in motions, which are short
 SETTLE_S = 2.0  # excluded start: transients of robot and filters [s]
 
 VARIANTS = {
@@ -128,14 +143,65 @@ def run(case: Case, noise: str, seed: int, duration: float, errors: dict[str, Er
         for name, (qpos, qvel) in states.items():
             errors[name].add_state(state, qpos, qvel)
         if tick % EVERY == 0:
-            true = _predict(rollout, state, loop.action, state.true_qpos, state.true_qvel)
-            for name, (qpos, qvel) in states.items():
-                moved = _predict(rollout, state, loop.action, qpos, qvel)
-                for horizon in HORIZONS:
-                    error = float(np.linalg.norm(moved[horizon] - true[horizon]))
-                    errors[name].predicted[horizon].append(error)
+            _add_predictions(rollout, state, loop.action, states, errors)
     rollout.close()
     loop.close()
+
+
+def run_motion(robot: str, name: str, noise: str, seed: int, errors: dict[str, Errors]) -> None:
+    """Do the motion `name` in teleoperation, and add the errors of raw and synchronised states."""
+    motion, morphology = MOTIONS[name], make_morphology(robot)
+    plant = Simulation(morphology, SimulationConfig(noise=noise, seed=seed))
+    config = TeleoperationConfig(retargeter=RetargeterConfig(threads=1, seed=seed))
+    model = build_model(morphology, "planning")
+    rollout = PolicyRollout(model, make_policy(morphology.policies[0]), 1)
+    synchronise, synced = StateSync.synchronise, list[Synced]()
+
+    def watch(self: StateSync, *measurement: Any) -> Synced:
+        start = time.perf_counter()
+        synced.append(synchronise(self, *measurement))
+        errors[TELEOPERATION].seconds.append(time.perf_counter() - start)
+        return synced[-1]
+
+    with (
+        patch.object(StateSync, "synchronise", watch),
+        closed_loop(plant, config, seed=seed) as (loop, teleoperation),
+    ):
+        teleoperation.connect()
+        loop.reset(seed)
+        device = teleoperation.device = MotionDevice(motion, seed)
+        teleoperation.reset()
+        count = 0
+        while (clock := device.elapsed(loop.state.time)) < motion.end:
+            state = loop.state
+            action, tick = teleoperation.step(Tick(state))
+            executed = loop.execute(action, teleoperation.dt)
+            if not tick.engaged or clock < START_S:
+                continue
+            last = synced[-1]
+            states = {"raw": (state.qpos, state.qvel), TELEOPERATION: (last.qpos, last.qvel)}
+            for each, (qpos, qvel) in states.items():
+                errors[each].add_state(state, qpos, qvel)
+            if count % EVERY_IN_MOTIONS == 0:
+                _add_predictions(rollout, state, executed, states, errors)
+            count += 1
+    rollout.close()
+
+
+def _add_predictions(
+    rollout: PolicyRollout,
+    state: RobotState,
+    action: RobotAction,
+    states: dict[str, tuple[np.ndarray, np.ndarray]],
+    errors: dict[str, Errors],
+) -> None:
+    """Add the errors of predictions from states by variant, against one from the true state."""
+    true = _predict(rollout, state, action, state.true_qpos, state.true_qvel)
+    for name, (qpos, qvel) in states.items():
+        moved = _predict(rollout, state, action, qpos, qvel)
+        for horizon in HORIZONS:
+            error = float(np.linalg.norm(moved[horizon] - true[horizon]))
+            errors[name].predicted[horizon].append(error)
 
 
 def _make_action(morphology: Morphology, case: Case, time_s: float) -> RobotAction:
@@ -211,17 +277,28 @@ def print_table(title: str, errors: dict[str, Errors]) -> None:
 def main() -> None:
     """Run the cases and print their tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--noise", default="mild", help="noise preset of the sensors")
+    parser.add_argument("--noise", default="mild", help="noise presets, with commas")
     parser.add_argument("--seeds", type=int, default=3, help="episodes per case, seeds 0, 1, …")
     parser.add_argument("--duration", type=float, default=12.0, help="duration of an episode [s]")
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--motions", default="", help="instead, motions in teleoperation")
+    parser.add_argument("--robots", default="g1,rby1", help="robots that do the motions")
     args = parser.parse_args()
-    print(f"noise {args.noise}, seeds 0 to {args.seeds - 1}, {args.duration} s each")
-    for name in args.cases:
-        errors = {variant: Errors() for variant in ("raw", *VARIANTS)}
-        for seed in range(args.seeds):
-            run(CASES[name], args.noise, seed, args.duration, errors)
-        print_table(name, errors)
+    for noise in args.noise.split(","):
+        print(f"noise {noise}, seeds 0 to {args.seeds - 1}")
+        if args.motions:
+            for robot in args.robots.split(","):
+                for motion in args.motions.split(","):
+                    errors = {variant: Errors() for variant in ("raw", TELEOPERATION)}
+                    for seed in range(args.seeds):
+                        run_motion(robot, motion, noise, seed, errors)
+                    print_table(f"{robot} {motion}", errors)
+            continue
+        for name in args.cases:
+            errors = {variant: Errors() for variant in ("raw", *VARIANTS)}
+            for seed in range(args.seeds):
+                run(CASES[name], noise, seed, args.duration, errors)
+            print_table(name, errors)
 
 
 if __name__ == "__main__":

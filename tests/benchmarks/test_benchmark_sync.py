@@ -30,3 +30,13 @@ def test_without_noise_a_prediction_from_the_raw_state_is_the_true_one():
     benchmark.run(benchmark.CASES["rby1 stands"], "off", 0, 2.5, errors)
     assert max(errors["raw"].predicted[10]) == 0
     assert max(errors["NLS + velocity + memory"].predicted[10]) < 1e-3
+
+
+def test_in_teleoperation_the_synchronised_state_is_the_better_one(capsys):
+    errors = {name: benchmark.Errors() for name in ("raw", benchmark.TELEOPERATION)}
+    benchmark.run_motion("g1", "walk_brisk", "mild", 0, errors)
+    benchmark.print_table("g1 walk_brisk", errors)
+    assert "g1 walk_brisk: 63 predictions, 125 states; RMS" in capsys.readouterr().out
+    raw, synced = errors.values()
+    assert np.mean(np.square(synced.velocity)) < 0.6 * np.mean(np.square(raw.velocity))
+    assert np.mean(np.square(synced.predicted[3])) < 0.25 * np.mean(np.square(raw.predicted[3]))
