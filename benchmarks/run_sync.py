@@ -16,6 +16,7 @@ is judged, from the beginning of the motion to its end.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,7 +32,6 @@ from xop_lerobot.core.state import RobotState
 from xop_lerobot.core.transforms import quat_yaw, wrap_angle
 from xop_lerobot.evaluation.trial import closed_loop
 from xop_lerobot.low_level.factory import make_policy
-from xop_lerobot.low_level.policy import POLICY_DT
 from xop_lerobot.morphology.morphology import Morphology, make_morphology
 from xop_lerobot.morphology.scene import build_model
 from xop_lerobot.plant.policy_loop import PolicyLoop
@@ -39,6 +39,7 @@ from xop_lerobot.plant.simulation import Simulation, SimulationConfig
 from xop_lerobot.retarget.config import RetargeterConfig
 from xop_lerobot.retarget.rollout import PolicyRollout
 from xop_lerobot.retarget.sync.config import SyncConfig
+from xop_lerobot.retarget.sync.prior import VelocityPrior
 from xop_lerobot.retarget.sync.state_sync import StateSync, Synced
 from xop_lerobot.session import Tick
 from xop_lerobot.teleoperation import TeleoperationConfig
@@ -60,8 +61,8 @@ VARIANTS = {
 }
 """Variants of the synchronisation, in addition to `raw`, the unchanged measurement."""
 PREDICTED = "all, and the prediction"
-"""The variant that also gets the base velocity predicted from its own last state, as in
-teleoperation, where it comes from the last plan."""
+"""The variant that also gets the base velocity predicted from its own last state and the executed
+action, as in teleoperation."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ def run(case: Case, noise: str, seed: int, duration: float, errors: dict[str, Er
     loop = PolicyLoop(morphology, Simulation(morphology, SimulationConfig(noise=noise)), policy)
     loop.reset(seed)
     rollout = PolicyRollout(model, policy, 1)
+    prior = VelocityPrior(morphology, policy, model, TICK)
     syncs = {name: StateSync(morphology, model, config) for name, config in VARIANTS.items()}
     states: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for tick in range(round(duration / TICK)):
@@ -130,7 +132,9 @@ def run(case: Case, noise: str, seed: int, duration: float, errors: dict[str, Er
         state = loop.state
         expected = None
         if tick:
-            expected = _predict_velocity(rollout, before, loop.action, *states[PREDICTED])
+            qpos, qvel = states[PREDICTED]
+            prior.note(dataclasses.replace(before, qpos=qpos, qvel=qvel), loop.action)
+            expected = prior.predict(state.time, before.time)
         states = {"raw": (state.qpos, state.qvel)}
         for name, sync in syncs.items():
             given = expected if name == PREDICTED else None
@@ -144,6 +148,7 @@ def run(case: Case, noise: str, seed: int, duration: float, errors: dict[str, Er
             errors[name].add_state(state, qpos, qvel)
         if tick % EVERY == 0:
             _add_predictions(rollout, state, loop.action, states, errors)
+    prior.close()
     rollout.close()
     loop.close()
 
@@ -226,20 +231,6 @@ def _predict(
     commands = np.broadcast_to(action.command, (1, max(HORIZONS), len(action.command)))
     predicted = rollout.predict(qpos, qvel, state.memory, commands, action.arms, action.mode)
     return predicted.qpos[0, :, :3] - qpos[:3]
-
-
-def _predict_velocity(
-    rollout: PolicyRollout,
-    state: RobotState,
-    action: RobotAction,
-    qpos: np.ndarray,
-    qvel: np.ndarray,
-) -> np.ndarray:
-    """Predict the linear velocity of the base one tick later [m/s]. Shape (3,)."""
-    steps = round(TICK / POLICY_DT)
-    commands = np.broadcast_to(action.command, (1, steps, len(action.command)))
-    predicted = rollout.predict(qpos, qvel, state.memory, commands, action.arms, action.mode)
-    return predicted.qvel[0, -1, :3]
 
 
 def _compute_up(quat: np.ndarray) -> np.ndarray:

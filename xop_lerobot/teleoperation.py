@@ -39,6 +39,7 @@ from xop_lerobot.retarget.factory import (
 from xop_lerobot.retarget.model.kinematics import SiteKinematics
 from xop_lerobot.retarget.online import AppliedChange, ModeSwitch, OnlineSettings
 from xop_lerobot.retarget.plan_follower import PlanFollower
+from xop_lerobot.retarget.sync.prior import VelocityPrior
 from xop_lerobot.retarget.sync.state_sync import StateSync, Synced
 from xop_lerobot.retarget.whole_body import WholeBodyController
 from xop_lerobot.session import RobotInfo, Tick
@@ -107,6 +108,9 @@ class Teleoperation:
             end=self._end_engagement,
         )
         self._sync = StateSync(self.morphology, model) if config.retargeter.sync else None
+        self._prior = None
+        if self._sync is not None and not self.morphology.contact_kind.tells_speed:
+            self._prior = VelocityPrior(self.morphology, policy, model, self.dt)
         self._kinematics = SiteKinematics(model, tuple(self.morphology.frames.values()))
         self._driver = WholeBodyController(self.morphology, policy, self._follower, self.dt)
         self._arms = self._driver.arms
@@ -120,6 +124,8 @@ class Teleoperation:
         self._driver.reset()
         if self._sync is not None:
             self._sync.reset()
+        if self._prior is not None:
+            self._prior.forget()
         self._mode = ModeSwitch(self.device.start_mode)
         self._follower.forget()
         self._last_time: float | None = None
@@ -133,6 +139,8 @@ class Teleoperation:
         """Close the device and stop all threads; may be called twice."""
         self.device.disconnect()
         self._follower.close()
+        if self._prior is not None:
+            self._prior.close()
 
     def reset(
         self, obstacles: tuple[Obstacle, ...] | None = None, episode: int | None = None
@@ -262,6 +270,8 @@ class Teleoperation:
         else:
             wanted = self._driver.drive(state, goal, poses["head"], dt)
         action = self._driver.limit(state, wanted)
+        if self._prior is not None:
+            self._prior.note(state, action)
         plan = None if goal is None else self._follower.current
         cost = {} if plan is None else plan.plan.cost
         health = {} if synced is None else synced.health
@@ -303,7 +313,9 @@ class Teleoperation:
         """Make the measured state consistent with the ground contacts; the true state is kept."""
         if self._sync is None:
             return state, None
-        expected = self._follower.predict_velocity(state.time, self._sync.time)
+        expected = None
+        if self._prior is not None:
+            expected = self._prior.predict(state.time, self._sync.time)
         synced = self._sync.synchronise(state.time, state.qpos, state.qvel, state.mode, expected)
         return dataclasses.replace(state, qpos=synced.qpos, qvel=synced.qvel), synced
 

@@ -100,25 +100,6 @@ def test_latency_is_the_median_in_control_steps():
     assert meter.steps == 0
 
 
-def predict(plan: StampedPlan, time: float) -> np.ndarray:
-    velocity = plan.predict_velocity(time)
-    assert velocity is not None
-    return velocity
-
-
-def test_a_plan_tells_the_velocity_that_it_predicts():
-    velocities = np.outer(np.arange(4), [1.0, 2.0, 3.0])
-    plan = make_plan(1.0, velocities=velocities)
-    np.testing.assert_allclose(predict(plan, 1.0), [0, 0, 0])
-    np.testing.assert_allclose(predict(plan, 1.03), [1.5, 3, 4.5])
-    np.testing.assert_allclose(predict(plan, 1.06), [3, 6, 9])
-    np.testing.assert_allclose(predict(plan, 1.06 + 1e-9), [3, 6, 9])
-    assert plan.predict_velocity(0.98) is None
-    assert plan.predict_velocity(1.08) is None
-    assert make_plan(1.0).predict_velocity(1.0) is None
-    assert make_plan(1.0, velocities=np.full((4, 3), np.nan)).predict_velocity(1.0) is None
-
-
 # -- prediction ----------------------------------------------------------------------------
 
 

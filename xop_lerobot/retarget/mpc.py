@@ -340,7 +340,6 @@ class MpcRetargeter(Retargeter):
             commands=planned[:, :count],
             mode=mode,
             qpos=prediction.qpos[best],
-            velocities=prediction.qvel[best, :, :3],
             arms={names[i]: planned[:, i] for i in arms},
             cost={name: _finite(term[best]) for name, term in scores.terms.items()},
             health={"intervention": float(verdict.intervention), "risk": verdict.risk},

@@ -39,8 +39,6 @@ class Plan:
         commands: The planned sequence, one for each control step. Shape (H, k).
         mode: Mode that the plan was made for.
         qpos: Predicted positions under the plan's best sample; empty for `direct`. (H + 1, nq).
-        velocities: Predicted linear velocity of the base under that sample, world axes [m/s]; empty
-            for `direct`. Shape (H + 1, 3).
         arms: Targets of the arm joints that the plan decides, by joint, one per control step
             [rad]; the other joints are left to inverse kinematics. Shapes (H,).
         cost: Cost of the best sample by term.
@@ -54,7 +52,6 @@ class Plan:
     commands: np.ndarray
     mode: Mode
     qpos: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    velocities: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     arms: Mapping[str, np.ndarray] = field(default_factory=dict)
     cost: Mapping[str, float] = field(default_factory=dict)
     health: Mapping[str, float] = field(default_factory=dict)
@@ -159,21 +156,6 @@ class StampedPlan(NamedTuple):
             "status": float(self.plan.status),
             **self.plan.health,
         }
-
-    def predict_velocity(self, time: float) -> np.ndarray | None:
-        """Predicted linear velocity of the base at `time`, world axes [m/s].
-
-        Returns:
-            Shape (3,); None outside the predicted horizon.
-        """
-        velocities, step = self.plan.velocities, (time - self.time) / POLICY_DT
-        if not -0.5 <= step <= len(velocities) - 0.5:  # tolerate half a step of rounding
-            return None
-        step = min(max(step, 0.0), len(velocities) - 1.0)
-        first = min(int(step), max(len(velocities) - 2, 0))
-        pair = velocities[first : first + 2]
-        velocity = pair[0] + (step - first) * (pair[-1] - pair[0])
-        return velocity if np.isfinite(velocity).all() else None
 
 
 class PlanTrack:

@@ -352,24 +352,6 @@ class PlanFollower:
             self._asked_time = state.time
         self.current = self.background.at(state.time)
 
-    def predict_velocity(self, time: float, since: float) -> np.ndarray | None:
-        """Velocity of the base at `time` as predicted by the newest plan, for state sync.
-
-        Args:
-            time: The robot's clock [s].
-            since: Time of the measurement that the plan must be based on [s]. An older plan holds
-                no information that the synchronised state of `since` does not have already.
-
-        Returns:
-            Linear velocity, world axes [m/s], shape (3,); None without such a plan.
-        """
-        if self.current is None:
-            return None
-        newest = self.current if self.background is None else self.background.latest
-        if newest is None or newest.measured != since:
-            return None
-        return newest.predict_velocity(time)
-
     def _measure_latency(self, background: BackgroundPlanner, time: float) -> None:
         newest = background.latest
         if newest is not None and newest.measured != self._seen_time:
