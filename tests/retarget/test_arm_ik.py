@@ -238,6 +238,8 @@ def test_the_bound_is_of_the_distances_that_are_left(arms, name):
         qpos = a.place(a.rest + 0.8 * rng.uniform(-1, 1, len(a.rest)))
         configuration.update(qpos)
         matrix, bound = limit.compute_qp_inequalities(configuration, 0.02)
+        assert matrix is not None
+        assert bound is not None
         distance = measure(qpos)
         step = np.zeros(a.model.nv)
         step[[int(a.model.joint(joint).dofadr[0]) for joint in a.joints]] = rng.normal(

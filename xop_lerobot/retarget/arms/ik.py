@@ -53,6 +53,7 @@ class Clearance(mink.CollisionAvoidanceLimit):
     ) -> mink.Constraint:
         r"""Compute the inequality :math:`G\,\Delta q \le h`."""
         matrix, bound = super().compute_qp_inequalities(configuration, dt)
+        assert bound is not None
         distance = bound * dt + _DEEP  # infinite for pairs that are far apart
         approach = np.maximum((distance - CLEARANCE) / _APPROACH_S, -_RETREAT)
         return mink.Constraint(matrix, approach * dt)
