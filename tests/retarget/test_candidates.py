@@ -179,6 +179,19 @@ def test_a_neck_takes_what_is_too_quick_for_the_chest(bench, mode, yaw, pitch):
     assert np.abs(b.loop.state.command[neck]).max() > 0.1
 
 
+def test_a_neck_that_is_not_free_stays_where_it_is(bench):
+    b = bench("rby1", candidates=("proposal",))
+    space, model = b.morphology.command_space, b.retargeter.command_model
+    turned = space.neutral.copy()
+    turned[space.index("head_0")] = 0.3
+    for _ in range(10):
+        b.loop.execute(RobotAction(turned, Mode.STATIONARY, b.loop.action.arms), DT)
+    b.retargeter.configure(body=("torso_5",))
+    plan = b.tick(Mode.STATIONARY)
+    assert plan.command[space.index("head_0")] == pytest.approx(0.3)
+    assert not (model.neck & model.body).any()
+
+
 def test_a_neck_turns_back_from_a_chest_that_is_slower(bench):
     """A head that looks ahead again, with the chest turned by 0.6 rad."""
     b = bench("rby1", candidates=("proposal",))

@@ -207,7 +207,7 @@ class CommandModel:
         stays = ~self.body & ~self._is_velocity
         held = np.where(stays, executed, self.space.neutral)
         held = np.where(self.acting(mode), decisions, held)
-        return held if proposal is None else np.where(self.neck, proposal, held)
+        return held if proposal is None else np.where(self.neck & self.body, proposal, held)
 
     def _compute_share(self, dt: float) -> np.ndarray:
         """Fraction of a step response that height and joints reach after `dt`. Shape (k,)."""
