@@ -55,7 +55,7 @@ def run(monkeypatch, command: str, *flags: str) -> None:
 
 @pytest.mark.parametrize(
     ("device", "config", "state", "action"),
-    [(XopG1, XopG1Config, 67, 22), (XopRby1, XopRby1Config, 61, 25)],
+    [(XopG1, XopG1Config, 67, 22), (XopRby1, XopRby1Config, 61, 27)],
 )
 @pytest.mark.parametrize("cameras", [["head"], ["head", "scene"]])
 def test_a_policy_is_made_for_state_pictures_and_action_alone(
@@ -128,7 +128,7 @@ def test_a_trained_policy_has_these_inputs_and_outputs(policy):
         "observation.images.head": (3, HEIGHT, WIDTH),
     }
     assert {key: tuple(each.shape) for key, each in config.output_features.items()} == {
-        "action": (25,)
+        "action": (27,)
     }
 
 

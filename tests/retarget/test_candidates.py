@@ -174,7 +174,8 @@ def test_a_neck_takes_what_is_too_quick_for_the_chest(bench, mode, yaw, pitch):
         b.loop.execute(RobotAction(plan.command, mode, b.loop.action.arms), DT)
     reached = b.compute_head(b.loop.state.qpos)
     assert np.linalg.norm(rotation_error(head[3:], reached[3:])) < 0.2
-    assert np.linalg.norm(reached[:3] - head[:3]) < 0.08  # eyes are 8 cm from the neck's axes
+    # The eyes are 8 cm from the neck's axes, and the chest has begun to take its share.
+    assert np.linalg.norm(reached[:3] - head[:3]) < 0.12
     neck = [name.startswith("head") for name in b.morphology.command_space.names]
     assert np.abs(b.loop.state.command[neck]).max() > 0.1
 

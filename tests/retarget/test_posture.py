@@ -66,8 +66,12 @@ class Robot:
         return bool(stands and self.load.compute_excess(qpos[None]).max() <= 0)
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
-        """A command in which it can stand, anywhere in its bounds, its head like a person's."""
+        """A command in which it can stand, anywhere in its bounds, its head like a person's.
+
+        Its neck is straight: it never turns further than the head, or the other way.
+        """
         moves = self.command_model.acting(Mode.STATIONARY) & ~self.command_model.is_velocity()
+        moves &= ~self.command_model.neck
         while True:
             drawn = rng.uniform(self.space.low, self.space.high)
             command = np.where(moves, drawn, self.space.neutral)

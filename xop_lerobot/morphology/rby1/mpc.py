@@ -36,9 +36,10 @@ EFFECTS = (
         for i, effort in enumerate((10.0, 4.0, 4.0, 4.0, 10.0, 1.0))
     ),
     # The neck is quick: it takes the first part of a turn of the head, until the chest has
-    # followed, and its share of a nod.
+    # followed, and its share of a nod: at less effort than the torso's, knees stay bent in front of
+    # a goal at chest height, with the head 6 cm off.
     Effect(Acts.JOINT, "head_0", lag_s=0.05, effort=20.0, gaze=GazeLimit(Gaze.HEADING), neck=True),
-    Effect(Acts.JOINT, "head_1", lag_s=0.05, gaze=GazeLimit(Gaze.PITCH), neck=True),
+    Effect(Acts.JOINT, "head_1", lag_s=0.05, effort=4.0, gaze=GazeLimit(Gaze.PITCH), neck=True),
 )
 
 DRIVING = Driving(
